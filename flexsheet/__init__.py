@@ -1,6 +1,6 @@
 """Build, run, record and evaluate node graphs of an encountered-type visual-haptic display.
 
-A name is imported on first use, so that `import flexsheet` is fast. The message types are in
+A name is imported on first use, because importing all names takes long. The message types are in
 `flexsheet.messages.types`, and the types of scenes are in `flexsheet.messages.scene`.
 """
 
@@ -27,36 +27,24 @@ if TYPE_CHECKING:
     from flexsheet.messages.topics import TOPICS, find_topic
     from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
-_MODULES = {
-    "BadInputError": "flexsheet.launch.plans.documents",
-    "BagError": "flexsheet.messages.bag",
-    "BagReader": "flexsheet.messages.bag",
-    "BagWriter": "flexsheet.messages.bag",
-    "Driver": "flexsheet.launch.experiments.driver",
-    "ExperimentError": "flexsheet.launch.experiments",
-    "GraphWriter": "flexsheet.launch.running.tools",
-    "Header": "flexsheet.messages.base",
-    "Input": "flexsheet.nodes.node",
-    "Message": "flexsheet.messages.base",
-    "Node": "flexsheet.nodes.node",
-    "NodeFailedError": "flexsheet.launch.running.supervisor",
-    "NodeParameters": "flexsheet.nodes.node",
-    "Output": "flexsheet.nodes.node",
-    "ResolvedGraph": "flexsheet.launch.plans.plan_model",
-    "RunningGraph": "flexsheet.launch.running.supervisor",
-    "Scene": "flexsheet.messages.scene",
-    "SystemClock": "flexsheet.messages.clock",
-    "TOPICS": "flexsheet.messages.topics",
-    "VirtualClock": "flexsheet.messages.clock",
-    "find_topic": "flexsheet.messages.topics",
-    "load_graph": "flexsheet.launch.plans.plan",
-    "load_scene": "flexsheet.launch.plans.plan",
-    "periodic": "flexsheet.nodes.node",
-    "read_table": "flexsheet.launch.bags.parquet",
-    "read_topic": "flexsheet.launch.running.tools",
-    "recover": "flexsheet.messages.bag",
-    "run_experiment": "flexsheet.launch.experiments.run",
+_EXPORTS = {
+    "flexsheet.launch.bags.parquet": ("read_table",),
+    "flexsheet.launch.experiments": ("ExperimentError",),
+    "flexsheet.launch.experiments.driver": ("Driver",),
+    "flexsheet.launch.experiments.run": ("run_experiment",),
+    "flexsheet.launch.plans.documents": ("BadInputError",),
+    "flexsheet.launch.plans.plan": ("load_graph", "load_scene"),
+    "flexsheet.launch.plans.plan_model": ("ResolvedGraph",),
+    "flexsheet.launch.running.supervisor": ("NodeFailedError", "RunningGraph"),
+    "flexsheet.launch.running.tools": ("GraphWriter", "read_topic"),
+    "flexsheet.messages.bag": ("BagError", "BagReader", "BagWriter", "recover"),
+    "flexsheet.messages.base": ("Header", "Message"),
+    "flexsheet.messages.clock": ("SystemClock", "VirtualClock"),
+    "flexsheet.messages.scene": ("Scene",),
+    "flexsheet.messages.topics": ("TOPICS", "find_topic"),
+    "flexsheet.nodes.node": ("Input", "Node", "NodeParameters", "Output", "periodic"),
 }
+_MODULES = {name: module for module, names in _EXPORTS.items() for name in names}
 
 _FORMER_NAMES = {
     "Plan": "ResolvedGraph",

@@ -1,11 +1,10 @@
-"""Entry point of the `flexsheet` command and, with `--node CONFIG`, of a process with nodes.
+"""Run the `flexsheet` command or, with `--node CONFIG`, a process with nodes.
 
 The first statements give SIGINT its default action, which ends a process without a traceback.
-Python's own handler raises an exception wherever the code is: in an import it prints a traceback,
-in a callback of the garbage collector it is ignored.  `launch.cli` restores the handler for
-commands that clean up; graphs and nodes handle SIGINT in their event loop (`nodes.signals`).  A
-SIGINT that is ignored or blocked by inheritance is enabled again; docs/nodes-and-processes.md says
-why.
+Python's own handler would print a traceback during imports, and its exception is lost in callbacks
+of the garbage collector. `launch.cli` restores the handler for commands that clean up. Graphs and
+nodes handle SIGINT in their event loop (`nodes.signals`). SIGINT is enabled even if the parent
+process ignores or blocks it (docs/nodes-and-processes.md).
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
 def main() -> None:
-    """Run the command, or with `--node CONFIG` nodes, as the launcher does."""
+    """Run the command, or nodes if the arguments are `--node CONFIG`."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
         _run_node(sys.argv[2])
     if len(sys.argv) == 4 and sys.argv[1] == FORK_SERVER_FLAG:
@@ -74,7 +73,7 @@ def _run_node(config_file: str) -> NoReturn:
 
 
 def _shorten_imports() -> None:
-    """Shorten the imports of a node, until `nodes.runner` enables garbage collection again."""
+    """Disable garbage collection during imports, and import structlog without rich."""
     gc.disable()
     if "structlog" in sys.modules:
         return
@@ -86,7 +85,7 @@ def _shorten_imports() -> None:
 
 
 def _avoid_garbage_collection() -> None:
-    """Collect rarely during imports and not at exit, where it takes a sixth of a command's time."""
+    """Collect garbage rarely and not at exit, because it takes a sixth of a command's time."""
     gc.set_threshold(100_000)
     atexit.register(gc.freeze)
 

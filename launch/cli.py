@@ -1,7 +1,7 @@
 """Define the entry point of the `flexsheet` command.
 
-The table `COMMANDS` lists all subcommands. The module of a subcommand in `launch.commands` is
-imported only when the subcommand is called, so that commands start fast.
+The table `COMMANDS` lists all subcommands. A subcommand is imported when it is called, because
+importing all of them takes long.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 """The modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
 The first module defines the typer app. Its variable is `app`, or the name after the colon. The
-other modules add commands to the app with `register(app)`.
+other modules add commands to the app when they are imported.
 """
 
 
@@ -75,7 +75,7 @@ def load_command(name: str) -> Any:
     module, _, attribute = first.partition(":")
     app: typer.Typer = getattr(_import(module), attribute or "app")
     for other in further:
-        _import(other).register(app)
+        _import(other)
     command = get_command(app)
     command.name = name
     name_values(command)
@@ -87,9 +87,8 @@ def _import(module: str) -> Any:
 
 
 INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms", "view"})
-"""The commands for which Python's SIGINT handler is not installed.
+"""The commands that SIGINT ends without cleanup until their event loop handles the signal.
 
-Before the event loop of such a command handles SIGINT, the signal ends the command without cleanup.
 In all other commands, Python's handler raises KeyboardInterrupt, and the command cleans up.
 """
 
@@ -107,7 +106,7 @@ ROS_COMMANDS = {
 
 
 class CommandTable(Mapping[str, Any]):
-    """A read-only table of commands by name, which imports a command when it is first used."""
+    """A read-only table of commands by name; a command is imported when it is first used."""
 
     def __getitem__(self, name: str) -> Any:
         return load_command(name)
@@ -191,18 +190,14 @@ def main() -> None:
 
 
 def error_text(error: Exception) -> str:
-    """Return the text of an error.
-
-    For an error of the operating system, the text also contains the path and a remedy.
-    """
+    """Return the text of an error; for an error of the operating system, add path and remedy."""
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
     return str(make_write_error(Path(error.filename or "standard output"), error))
 
 
 def explained_by(error: Exception) -> str | None:
-    """Return the command line that explains an error; None if the error's text contains the
-    remedy."""
+    """Return the command line that explains an error; None if its text contains the remedy."""
     if not isinstance(error, FlexsheetError) or isinstance(error, CommandError):
         return None
     if error.exit_code == BAD_INPUT or isinstance(error.__cause__, FileNotFoundError):

@@ -6,9 +6,9 @@ UNITS = {
     "metres_per_px": "m/px", "_ns_per_m": "N s/m", "_m_per_s3": "m/s³", "_rad_per_s3": "rad/s³",
     "_per_s3": "1/s³", "_m_per_s2": "m/s²", "_rad_per_s2": "rad/s²", "_per_s2": "1/s²",
     "_m_per_s": "m/s", "_rad_per_s": "rad/s", "_per_s": "1/s", "_n_per_m": "N/m",
-    "_kg_per_m3": "kg/m³", "_m2": "m²", "_hz": "Hz", "_rad": "rad", "_deg": "°", "_px": "px",
-    "_kg": "kg", "_pa": "Pa", "_bytes": "bytes", "_ratio": "1", "_ms": "ms", "_mm": "mm",
-    "_n": "N", "_m": "m", "_s": "s",
+    "_kg_per_m3": "kg/m³", "_m_per_n": "m/N", "_m2": "m²", "_hz": "Hz", "_rad": "rad",
+    "_deg": "°", "_px": "px", "_kg": "kg", "_pa": "Pa", "_bytes": "bytes", "_ratio": "1",
+    "_ms": "ms", "_mm": "mm", "_n": "N", "_m": "m", "_s": "s",
 }  # fmt: skip
 """The units by suffix of a name. A longer suffix stands before a shorter one that it ends with."""
 

@@ -11,6 +11,7 @@ import pytest
 import structlog
 from hypothesis import settings
 
+from tests.commands import Command
 from tests.examples import USUAL
 from tests.shared import FOLDER_VARIABLE
 
@@ -50,6 +51,12 @@ LONGEST = (
 
 SKIPPED_FILE = "SKIPPED_FILE"
 """Environment variable: the file that gets a line for each skipped test.  `make test` prints it."""
+
+
+@pytest.fixture
+def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Return a function that runs the command in this process."""
+    return Command(capsys, monkeypatch)
 
 
 def pytest_configure(config: pytest.Config) -> None:

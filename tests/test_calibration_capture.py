@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from flexsheet.launch import cli
 from flexsheet.launch.calibration.bundle import pose_vector
 from flexsheet.launch.calibration.capture import (
     TILTS,
@@ -43,6 +42,7 @@ from flexsheet.messages.scene import Scene, StereoCamera
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import make_true_camera
+from tests.commands import Command
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -302,29 +302,11 @@ def test_ctrl_c_keeps_the_images_taken(camera: StereoCamera, tmp_path: Path) -> 
     assert np.array_equal(kept, pictures[1][1])
 
 
-Flexsheet = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Flexsheet:
-    """Return a function that runs the command in this process: exit code, stdout, stderr."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        out, err = capsys.readouterr()
-        code = ended.value.code
-        return (code if isinstance(code, int) else 0), out, err
-
-    return run
-
-
 GIVEN = ("--board", "7x5", "--square-mm", "30")
 
 
 def test_the_twin_is_calibrated_by_the_command(
-    flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
+    flexsheet: Command, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
     """The test covers live capture, the file, the report, and a check with other images."""
     taken, report, output = tmp_path / "taken", tmp_path / "report", tmp_path / "rig.yaml"
@@ -381,7 +363,7 @@ def test_the_twin_is_calibrated_by_the_command(
 
 
 def test_images_are_taken_from_the_camera_source(
-    flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
+    flexsheet: Command, scene_file: Path, camera: StereoCamera, tmp_path: Path
 ) -> None:
     """Image files replace the cameras; each image is repeated four times, as of a resting board."""
     for number, views in enumerate(shown(CHESSBOARD, camera, 6, seed=3)):
@@ -398,7 +380,7 @@ def test_images_are_taken_from_the_camera_source(
     taken = len(list((tmp_path / "taken").glob("left*.png")))
     assert taken >= 5
     assert f"{taken} pairs in" in err
-    assert f"pairs used     {taken} of {taken}" in out
+    assert re.search(rf"^pairs +{taken}$", out, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -420,7 +402,7 @@ def test_images_are_taken_from_the_camera_source(
     ],
 )
 def test_errors_name_a_remedy(
-    flexsheet: Flexsheet, scene_file: Path, tmp_path: Path, given: tuple[str, ...], printed: str
+    flexsheet: Command, scene_file: Path, tmp_path: Path, given: tuple[str, ...], printed: str
 ) -> None:
     words = [str(scene_file) if word == "SCENE" else word for word in given]
     code, _, err = flexsheet("calibrate", "stereo", *words, *GIVEN, "-o", tmp_path / "c.yaml")
@@ -428,7 +410,7 @@ def test_errors_name_a_remedy(
     assert printed in err
 
 
-def test_a_board_to_print_is_written(flexsheet: Flexsheet, tmp_path: Path) -> None:
+def test_a_board_to_print_is_written(flexsheet: Command, tmp_path: Path) -> None:
     path = tmp_path / "board.svg"
     code, out, err = flexsheet(
         "calibrate", "board", *GIVEN, "--marker-mm", 18, "-o", path, "--json"

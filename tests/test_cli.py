@@ -13,14 +13,12 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flexsheet.launch import cli
 from flexsheet.launch.commands.session import describe_node, describe_output
 from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
@@ -30,6 +28,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Display, EStop, PortStatus, Status
 from flexsheet.nodes import NODES
+from tests.commands import Command
 from tests.test_doctor_hosts import make_status
 from tests.waiting import DEADLINE_S, wait_until
 
@@ -44,38 +43,6 @@ LISTENING: dict[str, Any] = {
     "nodes": {"listener": {"type": "tests.launch_nodes:Listener"}},
     "external_topics": ["twin/finger"],
 }
-
-
-@dataclass(frozen=True, slots=True)
-class CommandResult:
-    """Result of a command: exit code, stdout, stderr."""
-
-    code: int
-    out: str
-    err: str
-
-    def json(self) -> Any:
-        return json.loads(self.out)
-
-
-class Command:
-    """Runner of the command in this process."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-        self._capsys, self._monkeypatch = capsys, monkeypatch
-
-    def __call__(self, *arguments: object) -> CommandResult:
-        self._monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
-        self._capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        out, err = self._capsys.readouterr()
-        return CommandResult(int(end.value.code or 0), out, err)
-
-
-@pytest.fixture
-def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    return Command(capsys, monkeypatch)
 
 
 @pytest.fixture(scope="module")

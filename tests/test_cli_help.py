@@ -31,6 +31,7 @@ from flexsheet.launch.commands.output import (
 )
 from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
+from tests.commands import Command
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -244,16 +245,10 @@ def test_files_are_offered_by_their_suffix(tmp_path: Path) -> None:
     ],
 )
 def test_a_slip_is_answered_with_what_was_meant(
-    arguments: list[str],
-    printed: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], printed: str, flexsheet: Command
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["flexsheet", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    out, err = capsys.readouterr()
-    assert (end.value.code, out) == (2, "")
+    code, out, err = flexsheet(*arguments)
+    assert (code, out) == (2, "")
     assert printed in err
 
 
@@ -281,15 +276,13 @@ def test_colours_are_for_terminals_and_no_color_disables_them() -> None:
 
 
 def test_an_error_points_to_its_explanation_but_not_for_scripts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, flexsheet: Command
 ) -> None:
     bag = tmp_path / "no.mcap"
     bag.write_bytes(b"no bag")
     for further, pointed in (([], True), (["--json"], False)):
-        monkeypatch.setattr(sys, "argv", ["flexsheet", "bag", "info", str(bag), *further])
-        with pytest.raises(SystemExit):
-            cli.main()
-        assert ("flexsheet explain bag" in capsys.readouterr().err) == pointed
+        printed = flexsheet("bag", "info", bag, *further)
+        assert ("flexsheet explain bag" in printed.err) == pointed
 
 
 def test_logs_go_to_the_stderr_of_their_moment(monkeypatch: pytest.MonkeyPatch) -> None:

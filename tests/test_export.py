@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from flexsheet.launch.bags.export import ExportError, export
-from flexsheet.launch.cli import main
+from tests.commands import Command
 from tests.example_bag import DENT, LEFT, SCENE, TIP, VERTICES, write_example
 
 
@@ -113,13 +113,7 @@ def test_an_export_is_never_written_over(bag: Path, tmp_path: Path) -> None:
     assert output.read_bytes() == b"mine"
 
 
-def test_the_command(
-    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    output = tmp_path / "out.mcap"
-    arguments = ["flexsheet", "bag", "export", str(bag), str(output), "--json"]
-    monkeypatch.setattr(sys, "argv", arguments)
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code in (0, None)
-    assert json.loads(capsys.readouterr().out)["messages"]["object"] == 2
+def test_the_command(bag: Path, tmp_path: Path, flexsheet: Command) -> None:
+    printed = flexsheet("bag", "export", bag, tmp_path / "out.mcap", "--json")
+    assert printed.code == 0
+    assert printed.json()["messages"]["object"] == 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from mcap.reader import make_reader
 from ruamel.yaml import YAML
 
 from flexsheet.launch.bags.export import ExportError
-from flexsheet.launch.cli import main
 from flexsheet.launch.ros2.definitions import Ros2Error, list_fields, make_definitions
 from flexsheet.launch.ros2.mapping import VIEWS, list_ros_topics
 from flexsheet.messages.bag import BagWriter
@@ -22,6 +20,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Eye, Force, Frame, Status, TwinEye, TwinFinger
 from flexsheet.nodes.models.rigid import is_rigid, rotation_from_rpy
+from tests.commands import Command
 from tests.example_bag import (
     DENT,
     LEFT,
@@ -247,13 +246,8 @@ def test_an_existing_output_stays(bag: Path, tmp_path: Path) -> None:
     assert list(output.iterdir()) == []
 
 
-def test_the_command(
-    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(bag: Path, tmp_path: Path, flexsheet: Command) -> None:
     output = tmp_path / "out"
-    arguments = ["bag", "export", str(bag), "--format", "ros2", "-o", str(output), "--json"]
-    monkeypatch.setattr(sys, "argv", ["flexsheet", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code in (0, None)
-    assert json.loads(capsys.readouterr().out)["messages"]["/fingertip/point"] == 1
+    printed = flexsheet("bag", "export", bag, "--format", "ros2", "-o", output, "--json")
+    assert printed.code == 0
+    assert printed.json()["messages"]["/fingertip/point"] == 1

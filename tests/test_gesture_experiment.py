@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import typer
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from flexsheet.launch import cli
 from flexsheet.launch.commands.options import split_names
 from flexsheet.launch.experiments import ExperimentError, gestures, select_names
 from flexsheet.messages.bag import BagWriter
@@ -22,6 +20,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import Fingertip, TwinFinger
 from flexsheet.nodes.twin.finger import FingerMotion
+from tests.commands import Command
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = Scene.model_validate(
@@ -280,10 +279,8 @@ def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:
     "arguments", [("experiment", "gestures", "--names", "tapp"), ("demo", "--finger-path", "tapp")]
 )
 def test_a_wrong_name_is_answered_in_a_sentence(
-    arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: tuple[str, ...], flexsheet: Command
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["flexsheet", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 1
-    assert 'did you mean "tap"?' in capsys.readouterr().err
+    printed = flexsheet(*arguments)
+    assert printed.code == 1
+    assert 'did you mean "tap"?' in printed.err

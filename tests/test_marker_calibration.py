@@ -17,8 +17,7 @@ from flexsheet.launch.calibration.touches import (
     read_touches,
     simulate_touches,
 )
-from flexsheet.launch.commands.calibrate import app
-from flexsheet.launch.commands.calibrate_marker import register
+from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
@@ -59,8 +58,8 @@ def touch(tilt_deg: tuple[float, float], random: np.random.Generator, **options:
 
 
 def calibrate(arguments: list[str]) -> dict[str, object]:
-    register(app)
-    result = CliRunner().invoke(app, ["marker", *arguments, "--json"], catch_exceptions=False)
+    arguments = ["calibrate", "marker", *arguments, "--json"]
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
@@ -245,8 +244,8 @@ def test_a_marker_of_another_scene_is_refused(tmp_path: Path) -> None:
 
 
 def test_exactly_one_source_is_required(tmp_path: Path) -> None:
-    register(app)
-    result = CliRunner().invoke(app, ["marker", "-o", str(tmp_path / "marker.yaml")])
+    arguments = ["calibrate", "marker", "-o", str(tmp_path / "marker.yaml")]
+    result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, CommandError)
     assert "give exactly one source of touches: --rows CSV or --twin SCENE" in str(result.exception)
 

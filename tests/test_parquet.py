@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from flexsheet.launch.bags.export import ExportError
-from flexsheet.launch.cli import main
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
@@ -22,6 +20,7 @@ from flexsheet.messages.types import (
     TwinEye,
 )
 from flexsheet.nodes.models.rigid import rotation_from_rpy, transform
+from tests.commands import Command
 from tests.example_bag import DENT, LEFT, RECORDED, SCENE, STARTED_NS, STEP_NS, TIP, write_example
 
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -117,13 +116,9 @@ def test_an_existing_folder_stays(bag: Path, tmp_path: Path) -> None:
         write_parquet(bag, tmp_path / "tables")
 
 
-def test_the_command(
-    bag: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["flexsheet", "bag", "to-parquet", str(bag), "--json"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code in (0, None)
-    answer = json.loads(capsys.readouterr().out)
+def test_the_command(bag: Path, flexsheet: Command) -> None:
+    printed = flexsheet("bag", "to-parquet", bag, "--json")
+    assert printed.code == 0
+    answer = printed.json()
     assert answer["messages"]["fingertip"] == 1
     assert (Path(answer["output"]) / "arm_left.parquet").is_file()

@@ -25,7 +25,8 @@ from flexsheet.launch.calibration.projector import (
     project_points,
 )
 from flexsheet.launch.cli import app
-from flexsheet.launch.commands.calibrate_projector import write_scene
+from flexsheet.launch.commands.calibrate import write_scene_values
+from flexsheet.launch.commands.calibrate_projector import list_scene_values
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Lens, Projector, Scene, StereoCamera
 from flexsheet.nodes.twin.eye import TrueProjector
@@ -206,7 +207,7 @@ def test_the_scene_keeps_its_comments_and_gets_the_projector(tmp_path: Path) -> 
     scene = load_scene(SCENE_FILE)
     found = make_true_projector(scene.projector, seed=5)
     copy = tmp_path / "scene.yaml"
-    write_scene(SCENE_FILE, found, copy)
+    write_scene_values(SCENE_FILE, list_scene_values(found), copy)
     before, after = (path.read_text().splitlines() for path in (SCENE_FILE, copy))
     changed = [line for line in after if line not in before]
     assert len(changed) == 2, changed

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch import cli
 from flexsheet.launch.health import layout
 from flexsheet.launch.health.layout import (
     Layout,
@@ -46,6 +44,7 @@ from flexsheet.nodes.arm_bridge.reach import (
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy
 from tests.arm_jacobian import jacobian
+from tests.commands import Command
 from tests.rv_1a import (
     CENTRE_RAD,
     find_branch,
@@ -374,7 +373,7 @@ def test_the_largest_reachable_tilt_is_proposed() -> None:
 
 
 def test_a_speed_that_is_too_high_gives_a_warning_and_the_largest_speed(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    flexsheet: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ball = make_ball(0.6)
     found = check_layout(ball)
@@ -386,7 +385,7 @@ def test_a_speed_that_is_too_high_gives_a_warning_and_the_largest_speed(
     assert calm.followed.all()
     assert calm.remedies == ()
     monkeypatch.setattr(layout, "check_layout", lambda scene, **_: found)
-    code, out, _ = run(capsys, monkeypatch, "doctor", "scene", SCENE_FILE)
+    code, out, _ = flexsheet("doctor", "scene", SCENE_FILE)
     assert code == 0
     assert re.search(r"^warning: the arms follow \d+ mm/s at only [\d.]+ % of", out, re.M)
     assert f"remedy: {remedy.what}" in out
@@ -416,29 +415,16 @@ def test_the_image_is_drawn(barred: Layout, tmp_path: Path) -> None:
     assert (tmp_path / "layout.png").stat().st_size > 10_000
 
 
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object
-        ) -> tuple[int, str, str]:  # fmt: skip
-    monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    out, err = capsys.readouterr()
-    return int(end.value.code or 0), out, err
-
-
-def test_the_commands_exit_code_is_the_reachability(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_commands_exit_code_is_the_reachability(flexsheet: Command, tmp_path: Path) -> None:
     picture = tmp_path / "layout.png"
-    code, out, _ = run(
-        capsys, monkeypatch, "doctor", "scene", SCENE_FILE, "--json", "--output", picture
-    )
+    code, out, _ = flexsheet("doctor", "scene", SCENE_FILE, "--json", "--output", picture)
     assert code == 0
     assert json.loads(out)["reachable"] is True
     assert picture.is_file()
 
 
 def test_the_command_fails_and_offers_a_remedy(
-    capsys: pytest.CaptureFixture[str],
+    flexsheet: Command,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     barred: Layout,
@@ -452,7 +438,7 @@ def test_the_command_fails_and_offers_a_remedy(
     far = tmp_path / "far.yaml"
     text = SCENE_FILE.read_text()
     far.write_text(text.replace("position_m: [-0.5, -0.45, 0.0]", "position_m: [-0.6, -0.5, 0.06]"))
-    code, out, _ = run(capsys, monkeypatch, "doctor", "scene", far)
+    code, out, _ = flexsheet("doctor", "scene", far)
     assert code == 1
     assert re.search(r"^reachable +NO$", out, re.M)
     assert "remedy: move the left base by" in out
@@ -467,11 +453,8 @@ def test_the_command_fails_and_offers_a_remedy(
     ],
 )
 def test_bad_input_to_the_command_is_named(
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[object],
-    words: str,
+    flexsheet: Command, arguments: list[object], words: str
 ) -> None:
-    code, _, err = run(capsys, monkeypatch, "doctor", "scene", *arguments)
+    code, _, err = flexsheet("doctor", "scene", *arguments)
     assert code == 2
     assert words in err

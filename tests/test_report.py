@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import sys
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +26,6 @@ from flexsheet.launch.bags.report.series import Events, Grid, Range, RunningMome
 from flexsheet.launch.bags.report.session import PortTotals, read_session
 from flexsheet.launch.bags.report.strokes import SheetErrors
 from flexsheet.launch.bags.report.write import make_result, report
-from flexsheet.launch.cli import main
 from flexsheet.launch.experiments.stroke import read_recording, stroke_errors, summary
 from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.methods import Methods
@@ -43,6 +41,7 @@ from flexsheet.messages.types import (
 from tests import sessions
 from tests.arm_states import arm_state
 from tests.colours import luminance
+from tests.commands import Command
 
 LONELY = ("scene", "fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "status",
           "twin/finger", "stereo", "twin/eye", "frame", "bookmark", "estop")  # fmt: skip
@@ -476,7 +475,7 @@ def test_where_no_page_can_be_written_the_bag_is_not_read(
 
 
 def test_the_command_writes_beside_the_bag_and_over_reports_only(
-    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flexsheet: Command
 ) -> None:
     copy = tmp_path / "b.mcap"
     copy.write_bytes(bag.read_bytes())
@@ -488,11 +487,9 @@ def test_the_command_writes_beside_the_bag_and_over_reports_only(
     letter.write_text("dear")
     with pytest.raises(BagError, match="is not a report, so it is not overwritten"):
         report(copy, letter, lambda done, whole: None)
-    monkeypatch.setattr(sys, "argv", ["flexsheet", "bag", "report", str(copy), "--json"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code in (0, None)
-    assert json.loads(capsys.readouterr().out)["bag"]["messages"] > 100
+    printed = flexsheet("bag", "report", copy, "--json")
+    assert printed.code == 0
+    assert printed.json()["bag"]["messages"] > 100
 
 
 def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:

@@ -194,10 +194,10 @@ def test_cyclone_describes_types_with_the_same_bytes_as_the_codec() -> None:
 
     ros = load_ros_types()
     header = ros.header(1_500_000_000, "world")
-    ours = ros.make("sensor_msgs/msg/JointState", {
-        "header": header, "name": ["a", "bc"], "position": np.array([1.0, 2.0]),
-        "velocity": np.zeros(0), "effort": np.zeros(0),
-    })  # fmt: skip
+    ours = ros.make(
+        "sensor_msgs/msg/JointState", header=header, name=["a", "bc"],
+        position=np.array([1.0, 2.0]), velocity=np.zeros(0), effort=np.zeros(0),
+    )  # fmt: skip
     theirs = peer.JointState(
         peer.Header(peer.Time(1, 500_000_000), "world"), ["a", "bc"], [1.0, 2.0], [], []
     )

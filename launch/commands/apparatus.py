@@ -7,23 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import (
-    CYLINDER,
-    CalibratedOption,
-    JsonOption,
-    ProfileOption,
-    SceneOption,
-    make_app,
-    output_file,
-)
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     examples,
     print_json,
-    print_table,
+    print_outcome,
+    print_rows,
     words,
 )
 
-app = make_app("Sample and show an apparatus: true parameters of the simulated hardware.")
+app = options.make_app("Sample and show an apparatus: true parameters of the simulated hardware.")
 
 
 @app.command(
@@ -41,15 +34,15 @@ def sample(
             help="Random seed; seeds 0 to 99 are for development, higher seeds for evaluation.",
         ),
     ],
-    output: Annotated[Path, output_file("Apparatus file to write.")],
-    profile: ProfileOption = "modern",
-    calibrated: CalibratedOption = False,
-    scene: SceneOption = CYLINDER,
-    as_json: JsonOption = False,
+    output: Annotated[Path, options.output_file("Apparatus file to write.")],
+    profile: options.ProfileOption = "modern",
+    calibrated: options.CalibratedOption = False,
+    scene: options.SceneOption = options.CYLINDER,
+    as_json: options.JsonOption = False,
 ) -> None:
-    """Sample a random apparatus within the tolerances of the hardware, and write it to a file.
+    """Write a random apparatus, which is a set of true parameters of simulated hardware.
 
-    An apparatus is a set of true parameters of simulated hardware.
+    The parameters are sampled within the tolerances of the hardware.
     """
     from flexsheet.launch.plans.apparatus import format_apparatus
     from flexsheet.launch.plans.plan import load_scene
@@ -60,10 +53,11 @@ def sample(
         load_scene(scene), seed, profile=Profile(profile), calibrated=calibrated
     )
     write_file(output, format_apparatus(drawn))
-    if as_json:
-        print_json({"file": str(output), "origin": drawn.origin, "scene": drawn.scene})
-    else:
-        words.print(f"{drawn.origin}: written to {output}")
+    print_outcome(
+        {"file": str(output), "origin": drawn.origin, "scene": drawn.scene},
+        f"{drawn.origin}: written to {output}",
+        as_json=as_json,
+    )
 
 
 @app.command(
@@ -80,8 +74,8 @@ def show(
             metavar="FILE|seed:N", help="Apparatus file, or seed:N for a random sample."
         ),
     ],
-    scene: SceneOption = CYLINDER,
-    as_json: JsonOption = False,
+    scene: options.SceneOption = options.CYLINDER,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Check an apparatus, and list how its parameters differ from the scene.
 
@@ -107,22 +101,7 @@ def show(
         print_json({"scene": loaded.scene, "origin": loaded.origin, "differences": rows})
         return
     words.print(f"scene {loaded.scene}, {loaded.origin}: {len(rows)} differences")
-    print_table(
-        ("parameter", "value", "nominal", "unit", ""),
-        [
-            (
-                row["parameter"],
-                _format(row["value"]),
-                "value in scene or node" if row["nominal"] is None else _format(row["nominal"]),
-                row["unit"],
-                "" if row["simulated"] else "not simulated",
-            )
-            for row in rows
-        ],
-    )
-
-
-def _format(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_format, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    for row in rows:
+        if row["nominal"] is None:
+            row["nominal"] = "value in scene or node"
+    print_rows(rows, as_json=False, digits=6)

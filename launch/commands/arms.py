@@ -15,7 +15,7 @@ from flexsheet.launch.commands.output import (
     CommandError,
     examples,
     print_json,
-    print_table,
+    print_rows,
     words,
 )
 from flexsheet.nodes import NodeRole
@@ -47,7 +47,7 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
 
     The exit code is 1 if an arm does not report its state.
     """
-    raise typer.Exit(run_interruptible(_command(run, None, lambda arms: len(arms) == 2, as_json)))
+    raise typer.Exit(_command(run, None, lambda arms: len(arms) == 2, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms enable"))
@@ -61,9 +61,7 @@ def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and all(arm.ready for arm in arms.values())
 
-    raise typer.Exit(
-        run_interruptible(_command(run, ("arming", Arming(ready=True)), done, as_json))
-    )
+    raise typer.Exit(_command(run, ("arming", Arming(ready=True)), done, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms disable --reason 'end of the session'"))
@@ -71,19 +69,18 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
     """Stop both arms and slacken the sheet until you run `flexsheet arms enable`."""
     from flexsheet.messages.types import Arming
 
-    message = Arming(ready=False, reason=reason)
-
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and not any(arm.ready for arm in arms.values())
 
-    raise typer.Exit(run_interruptible(_command(run, ("arming", message), done, as_json)))
+    command = ("arming", Arming(ready=False, reason=reason))
+    raise typer.Exit(_command(run, command, done, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms stop"))
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """Engage the software e-stop of the arms, which stays engaged until it is reset.
+    """Engage the software e-stop of the arms until `flexsheet arms reset`.
 
     This command does not replace the hard-wired e-stop. Without --run, it stops the arms of all
     graphs of this user on this computer.
@@ -105,7 +102,7 @@ async def _confirm_stop(
 ) -> int:
     """Print the results of the stop attempts and the states of the arms; return the exit code.
 
-    If no launcher has confirmed a stop, also publish an e-stop on the topic `estop`.
+    If no launcher has confirmed a stop, an e-stop is published on the topic `estop`.
     """
     from flexsheet.launch.running.stopping import StopOutcome, StopPath
     from flexsheet.messages.types import EStop
@@ -146,21 +143,30 @@ def reset(
     Arms with `arming: manual` then stay at rest until `flexsheet arms enable`. Simulated arms with
     `arming: auto` move as soon as they receive a target.
     """
+    from flexsheet.launch.plans.plan_model import tools_on
+    from flexsheet.launch.running.tools import tools_host
     from flexsheet.messages.types import EStop
 
-    message = EStop(engaged=False, reason=reason)
+    plan, found = running_graph(run)
+    host = tools_host(found)
+    if tools_on(host) not in plan.may_reset_estop():
+        raise CommandError(
+            f'host "{host}" is not allowed to reset an e-stop; reset it on '
+            f"{', '.join(plan.estop_resetters)}, "
+            f"or set hosts.{host}.may_reset_estop in {plan.launch_file}"
+        )
 
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and not any(arm.faults for arm in arms.values())
 
-    code = run_interruptible(_command(run, ("estop", message), done, as_json))
+    code = _command(run, ("estop", EStop(engaged=False, reason=reason)), done, as_json)
     if code == 0:
-        words.print(_describe_reset(running_graph(run)[0]))
+        words.print(_describe_reset(plan))
     raise typer.Exit(code)
 
 
 def _describe_reset(plan: ResolvedGraph) -> str:
-    """Return a text that states under which condition each arm moves after a reset."""
+    """Describe the condition under which each arm moves after a reset."""
     from flexsheet.launch.plans.plan_model import ArmingMode
 
     arming = {
@@ -181,10 +187,7 @@ def _describe_reset(plan: ResolvedGraph) -> str:
 
 
 class _Arms:
-    """A connection to a running graph that receives the states of the arms and publishes commands.
-
-    Use it as an asynchronous context manager.
-    """
+    """An asynchronous context manager that receives arm states and publishes commands."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
@@ -199,12 +202,11 @@ class _Arms:
         from flexsheet.launch.running.tools import make_subscriber
 
         for topic in TOPICS:
-            self._subscribers.append(
-                make_subscriber(
-                    topic, self._plan, self._run, self._on_state, on_problem=self.problems.append
-                )
+            subscriber = make_subscriber(
+                topic, self._plan, self._run, self._on_state, on_problem=self.problems.append
             )
-            self._subscribers[-1].start()
+            self._subscribers.append(subscriber)
+            subscriber.start()
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -225,7 +227,7 @@ class _Arms:
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Publish an e-stop without waiting for subscribers; return the result and its duration.
+        """Publish an e-stop at once, and return the result and its duration.
 
         The topic is latched, so subscribers that connect later also receive the e-stop.
         """
@@ -247,19 +249,15 @@ class _Arms:
         """Wait until `done` returns True for the recent arm states; return False on a timeout."""
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
-            if done(
-                {
-                    s: arm
-                    for s, arm in self.states.items()
-                    if now_s - self._received_s[s] < MAX_STATE_AGE_S
-                }
-            ):
+            ages_s = {side: now_s - received_s for side, received_s in self._received_s.items()}
+            recent = {s: arm for s, arm in self.states.items() if ages_s[s] < MAX_STATE_AGE_S}
+            if done(recent):
                 return True
             await asyncio.sleep(POLL_PERIOD_S)
         return False
 
 
-async def _command(
+def _command(
     run_directory: Path | None,
     command: tuple[str, Message] | None,
     done: Callable[[dict[str, ArmState]], bool],
@@ -270,36 +268,23 @@ async def _command(
     command: topic and message; None publishes nothing. done: function that receives the arm states
     and returns True when the command has had its effect. Returns the exit code.
     """
-    from flexsheet.launch.running.tools import tools_host
-
     plan, run = running_graph(run_directory)
-    _check_may_reset(plan, tools_host(run), command)
-    async with _Arms(plan, run) as arms:
-        if command is not None:
-            await arms.publish(*command)
-        confirmed = await arms.wait_for(done)
-    _show(arms.states, as_json)
-    for text in arms.problems:
-        words.print(text)
-    if not confirmed:
-        words.print(
-            "[red]not confirmed[/]: see the reasons above and the bridges' logs", markup=True
-        )
-    return 0 if confirmed else FAILED
 
+    async def work() -> int:
+        async with _Arms(plan, run) as arms:
+            if command is not None:
+                await arms.publish(*command)
+            confirmed = await arms.wait_for(done)
+        print_rows(_rows(arms.states), as_json=as_json)
+        for text in arms.problems:
+            words.print(text)
+        if not confirmed:
+            words.print(
+                "[red]not confirmed[/]: see the reasons above and the bridges' logs", markup=True
+            )
+        return 0 if confirmed else FAILED
 
-def _check_may_reset(plan: ResolvedGraph, host: str, command: tuple[str, Message] | None) -> None:
-    from flexsheet.launch.plans.plan_model import tools_on
-    from flexsheet.messages.types import EStop
-
-    if command is None or not isinstance(command[1], EStop) or command[1].engaged:
-        return
-    if tools_on(host) not in plan.may_reset_estop():
-        raise CommandError(
-            f'host "{host}" is not allowed to reset an e-stop; reset it on '
-            f"{', '.join(plan.estop_resetters)}, "
-            f"or set hosts.{host}.may_reset_estop in {plan.launch_file}"
-        )
+    return run_interruptible(work())
 
 
 def _rows(arms: dict[str, ArmState]) -> list[dict[str, Any]]:
@@ -330,26 +315,6 @@ def _show_stop(
     if as_json:
         print_json({"stopped": stopped, "paths": paths, "arms": _rows(arms)})
         return
-    print_table(("path", "to", "outcome", "after ms"), [tuple(path.values()) for path in paths])
+    print_rows(paths, as_json=False)
     print()
-    _show(arms, as_json=False)
-
-
-def _show(arms: dict[str, ArmState], as_json: bool) -> None:
-    rows = _rows(arms)
-    if as_json:
-        print_json(rows)
-        return
-    print_table(
-        ("arm", "mode", "ready", "reason", "faults"),
-        [
-            (
-                row["side"],
-                row["mode"],
-                "yes" if row["ready"] else "NO",
-                row["reason"],
-                "; ".join(row["faults"]),
-            )
-            for row in rows
-        ],
-    )
+    print_rows(_rows(arms), as_json=False)

@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands.graph import run_interruptible, run_node_here, running_graph
 from flexsheet.launch.commands.launching import print_omitted
-from flexsheet.launch.commands.options import (
-    BagArgument,
-    DurationOption,
-    JsonOption,
-    RunOption,
-    TopicsOption,
-    find_launch_file,
-    make_app,
-    output_file,
-)
 from flexsheet.launch.commands.output import (
     FAILED,
     OTHER_THAN_LIVE,
@@ -31,6 +21,8 @@ from flexsheet.launch.commands.output import (
     logs_on_stderr,
     print_fields,
     print_json,
+    print_outcome,
+    print_result,
     print_table,
     progress_bar,
     words,
@@ -45,7 +37,7 @@ if TYPE_CHECKING:
 PROGRESS_PERIOD_S = 0.2
 MAX_TOPICS_LISTED = 10
 
-app = make_app("Record, play and analyse bags, which are MCAP files of recorded topics.")
+app = options.make_app("Record, play and analyse bags, which are MCAP files of recorded topics.")
 
 FormerOutput = Annotated[Path | None, typer.Argument(help="Same as --output.", hidden=True)]
 
@@ -60,18 +52,15 @@ FormerOutput = Annotated[Path | None, typer.Argument(help="Same as --output.", h
 )
 def record(
     *,
-    bag: Annotated[
-        Path | None, typer.Argument(metavar="BAG", help="Bag file to write; same as --output.")
-    ] = None,
+    bag: Annotated[Path | None, typer.Argument(help="Bag file to write; same as --output.")] = None,
     output: Annotated[
         Path | None,
-        output_file("Bag file to write; default: runs/DATE-TIME.mcap.", "BAG"),
+        options.output_file("Bag file to write; default: runs/DATE-TIME.mcap.", "BAG"),
     ] = None,
-    topics: TopicsOption = None,
+    topics: options.TopicsOption = None,
     include: Annotated[
         list[str] | None,
         typer.Option(
-            "--include",
             metavar="TOPIC",
             help="Topic to record in addition to the default topics, such as stereo; repeat the "
             "option for several topics.",
@@ -100,9 +89,9 @@ def record(
             "file.",
         ),
     ] = None,
-    duration: DurationOption = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    duration: options.DurationOption = None,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Record topics of the running graph until Ctrl-C.
 
@@ -113,26 +102,21 @@ def record(
     if target.exists():
         raise CommandError(f"{target}: the file exists and is not overwritten; name a new file")
     logs_on_stderr()
-    limits = {
+    parameters = {
+        "bag": target,
+        "topics": topics or (),
+        "include": include or (),
         "max_bag_bytes": None if max_size_mb is None else round(1e6 * max_size_mb),
         "max_bag_duration_s": max_duration_s,
     }
-    run_interruptible(
-        _record(
-            target,
-            topics=topics or [],
-            include=include or [],
-            limits=limits,
-            running=running,
-            seconds=duration,
-        )
-    )
+    run_interruptible(_record(parameters, *running, duration))
     bags = sorted(target.parent.glob(f"{target.stem}-*{target.suffix}"))
     bags = [target, *(one for one in bags if one.stem.removeprefix(f"{target.stem}-").isdigit())]
-    if as_json:
-        print_json({"bag": str(target), "bags": [str(one) for one in bags]})
-    else:
-        words.print(f"recorded {', '.join(map(str, bags))}")
+    print_outcome(
+        {"bag": str(target), "bags": [str(one) for one in bags]},
+        f"recorded {', '.join(map(str, bags))}",
+        as_json=as_json,
+    )
 
 
 @app.command(
@@ -143,7 +127,7 @@ def record(
 )
 def play(
     *,
-    bag: BagArgument,
+    bag: options.BagArgument,
     rate: Annotated[
         float,
         typer.Option(
@@ -163,30 +147,44 @@ def play(
     loop: Annotated[
         bool, typer.Option("-l", "--loop", help="Repeat playback until Ctrl-C.")
     ] = False,
-    topics: TopicsOption = None,
+    topics: options.TopicsOption = None,
     launch: Annotated[
         Path | None,
         typer.Option(
-            "--launch",
-            metavar="LAUNCH_FILE",
             help="Launch file of a graph to start before playback and stop after it.",
-            autocompletion=complete.launch_files,
-            callback=find_launch_file,
+            **options.LAUNCH_FILE,
         ),
     ] = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Publish the messages of a bag to a running graph, or to a graph that --launch starts.
 
     Only topics that the launch file lists under `external_topics` are played.
     """
-    request = PlayRequest(bag, tuple(topics or ()), rate, start, loop, as_json)
-    raise typer.Exit(run_interruptible(_play(request, launch, run)))
+
+    async def play_into(plan: ResolvedGraph, found: Run) -> int:
+        return await _play(
+            bag, plan, found, topics=topics, rate=rate, start_s=start, loop=loop, as_json=as_json
+        )
+
+    async def start_and_play(launch_file: Path) -> int:
+        from flexsheet.launch.plans.plan import load_graph
+        from flexsheet.launch.running.supervisor import RunningGraph
+
+        plan = load_graph(launch_file)
+        print_omitted(plan, None)
+        async with RunningGraph(plan) as graph:
+            with words.status(f"starting {launch_file}"):
+                await graph.wait_ready()
+            return await play_into(plan, graph.run)
+
+    work = play_into(*running_graph(run)) if launch is None else start_and_play(launch)
+    raise typer.Exit(run_interruptible(work))
 
 
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
-def info(bag: BagArgument, as_json: JsonOption = False) -> None:
+def info(bag: options.BagArgument, as_json: options.JsonOption = False) -> None:
     """Print the topics, metadata and attachments of a bag, even if it is truncated."""
     from flexsheet.messages.bag import info as bag_info
 
@@ -217,10 +215,10 @@ def info(bag: BagArgument, as_json: JsonOption = False) -> None:
 
 @app.command(epilog=examples("flexsheet bag recover cut.mcap -o whole.mcap"))
 def recover(
-    bag: BagArgument,
+    bag: options.BagArgument,
     target: FormerOutput = None,
-    output: Annotated[Path | None, output_file("Recovered bag to write.", "BAG")] = None,
-    as_json: JsonOption = False,
+    output: Annotated[Path | None, options.output_file("Recovered bag to write.", "BAG")] = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Copy the readable messages of a truncated or damaged bag to a new bag."""
     from flexsheet.messages.bag import recover as recover_bag
@@ -228,21 +226,7 @@ def recover(
     output = _require_output(output or target)
     with progress_bar(f"recovering {bag.name}") as progress:
         report = recover_bag(bag, output, progress=progress)
-    if as_json:
-        print_json({**asdict(report), "output": str(output)})
-        return
-    print_fields(
-        [
-            ("bag", output),
-            ("from", f"{bag}, {'complete' if report.was_complete else report.problem}"),
-            ("recovered", f"{report.messages} messages, {report.attachments} attachments"),
-            (
-                "lost",
-                f"{report.damaged_chunks} damaged chunks, "
-                f"{report.orphan_messages} messages of unknown topics",
-            ),
-        ]
-    )
+    print_result({**asdict(report), "output": str(output)}, as_json=as_json)
 
 
 @app.command(
@@ -254,18 +238,18 @@ def recover(
 )
 def export(
     *,
-    bag: BagArgument,
+    bag: options.BagArgument,
     target: FormerOutput = None,
     output: Annotated[
         Path | None,
-        output_file("MCAP file to write; with --format ros2, a folder name gives a ROS 2 bag."),
+        options.output_file("MCAP file, or folder of a ROS 2 bag (--format ros2), to write."),
     ] = None,
     form: Annotated[
         Literal["foxglove", "ros2"],
         typer.Option("--format", help="foxglove: MCAP for Foxglove and Rerun; ros2: ROS 2."),
     ] = "foxglove",
-    topics: TopicsOption = None,
-    as_json: JsonOption = False,
+    topics: options.TopicsOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Convert a bag to an MCAP file for the viewers Foxglove and Rerun, or for ROS 2."""
     output = _require_output(output or target)
@@ -287,13 +271,14 @@ def export(
 )
 def to_parquet(
     *,
-    bag: BagArgument,
+    bag: options.BagArgument,
     output: Annotated[
-        Path | None, output_file("Folder to write; default: bag path without suffix.", "FOLDER")
+        Path | None,
+        options.output_file("Folder to write; default: path of the bag without suffix.", "FOLDER"),
     ] = None,
-    topics: TopicsOption = None,
+    topics: options.TopicsOption = None,
     images: Annotated[bool, typer.Option("--images", help="Also export images, as bytes.")] = False,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Convert each topic of a bag to a Parquet file, for pandas and other analysis tools."""
     from flexsheet.launch.bags.parquet import write_parquet
@@ -311,12 +296,11 @@ def to_parquet(
     )
 )
 def verify(
-    bag: BagArgument,
+    bag: options.BagArgument,
     node: Annotated[
         str,
         typer.Argument(
-            help="Node name in the bag's launch file.",
-            autocompletion=complete.node_types,
+            help="Node name in the bag's launch file.", autocompletion=complete.node_types
         ),
     ],
     tolerance: Annotated[
@@ -325,13 +309,13 @@ def verify(
             help="Maximum difference between replayed and recorded values, in their units.", min=0.0
         ),
     ] = 1e-6,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Run a node twice on its recorded inputs, and compare the outputs.
 
     The exit code is 1 if the two runs differ, if the node fails, or if it cannot be replayed. The
-    exit code is 3 if the two runs are equal but differ from the recorded outputs. This happens, for
-    example, if the node reads the system clock.
+    exit code is 3 if the two runs are equal but differ from the recorded outputs, for example
+    because the node reads the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
@@ -359,11 +343,11 @@ def verify(
     )
 )
 def report(
-    bag: BagArgument,
+    bag: options.BagArgument,
     output: Annotated[
-        Path | None, output_file("HTML file to write; default: next to the bag.")
+        Path | None, options.output_file("HTML file to write; default: next to the bag.")
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Write an HTML report on a recording, with faults, charts, tables and images.
 
@@ -391,7 +375,7 @@ def report(
     )
 )
 def plot(
-    bag: BagArgument,
+    bag: options.BagArgument,
     fields: Annotated[
         list[str],
         typer.Argument(
@@ -400,9 +384,10 @@ def plot(
         ),
     ],
     output: Annotated[
-        Path | None, output_file("Image file to write (.svg, .png); default: next to the bag.")
+        Path | None,
+        options.output_file("Image file to write (.svg, .png); default: next to the bag."),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Plot fields of recorded topics against time.
 
@@ -428,9 +413,7 @@ def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
         also = f" and {more} more" if more > 0 else ""
-        words.print(
-            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
-        )
+        words.print(f"not exported: {listed}{also} (recorded with incompatible message types)")
     if as_json:
         print_json({**asdict(result), "output": str(result.output)})
         return
@@ -483,7 +466,7 @@ def _print_verification(result: Verification) -> None:
 
 
 def _describe_result(result: Verification) -> str:
-    """Return a text about the result of `bag verify` and the likely cause of a difference."""
+    """Describe the result of `bag verify` and the likely cause of a difference."""
     if result.errors:
         return "the node failed; see its last error above"
     if not result.same_bytes:
@@ -509,15 +492,12 @@ def _format_worst(fields: dict[str, float]) -> str:
 
 
 async def _record(
-    bag: Path,
-    *,
-    topics: list[str],
-    include: list[str],
-    limits: dict[str, Any],
-    running: tuple[ResolvedGraph, Run],
-    seconds: float | None,
+    given: dict[str, Any], plan: ResolvedGraph, run: Run, seconds: float | None
 ) -> int:
-    """Record topics of the running graph in this process, and return the exit code 0."""
+    """Record topics of the running graph in this process, and return the exit code 0.
+
+    given: parameters of the recorder.
+    """
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file
     from flexsheet.launch.running.tools import tools_host
@@ -525,21 +505,15 @@ async def _record(
     from flexsheet.nodes.node import further_port
     from flexsheet.nodes.recorder.node import Recorder
     from flexsheet.nodes.recorder.parameters import RUN_FILES, RecorderParameters
-    from flexsheet.nodes.runner import NodeConfig, PortConfig, run_node
+    from flexsheet.nodes.runner import NodeConfig, PortConfig
 
-    plan, run = running
-    parameters = RecorderParameters(
-        bag=bag,
-        topics=tuple(topics),
-        include=tuple(include),
-        attach=tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES),
-        **limits,
-    )
+    attached = tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES)
+    parameters = RecorderParameters.model_validate({**given, "attach": attached})
     written = [topic for topic in TOPICS.values() if topic.name in plan.writers]
     names = Recorder.further_inputs(parameters, written)
     for name in names:
         if name not in plan.writers:
-            option = "--include" if name in include else "--topic"
+            option = "--include" if name in parameters.include else "--topic"
             raise CommandError(f"{option} {name}: the topic has no writer in the running graph")
     config = NodeConfig(
         name="bag_record",
@@ -559,24 +533,16 @@ async def _record(
         run_dir=str(run.directory),
     )
     words.print(f"recording {len(names)} topics; press Ctrl-C to stop")
-    stop = asyncio.Event()
-    work = asyncio.create_task(run_node(config, stop))
-    countdown = asyncio.create_task(_show_remaining(bag.name, seconds))
+    countdown = asyncio.create_task(_show_remaining(parameters.bag.name, seconds))
     try:
-        await asyncio.wait((work,), timeout=seconds)
+        await run_node_here(config, seconds)
     finally:
-        # Also after an interruption, wait until the recorder has closed the bag.
         countdown.cancel()
-        stop.set()
-        await work
     return 0
 
 
 async def _show_remaining(label: str, duration_s: float | None) -> None:
-    """Show a progress bar for a recording of limited duration.
-
-    Show nothing if `duration_s` is None, which means that the duration has no limit.
-    """
+    """Show a progress bar for a recording of limited duration; show nothing without a limit."""
     if duration_s is None:
         return
     loop = asyncio.get_running_loop()
@@ -587,67 +553,47 @@ async def _show_remaining(label: str, duration_s: float | None) -> None:
             await asyncio.sleep(PROGRESS_PERIOD_S)
 
 
-@dataclass(frozen=True, slots=True)
-class PlayRequest:
-    """The options of `bag play`.
+async def _play(
+    bag: Path,
+    plan: ResolvedGraph,
+    run: Run,
+    *,
+    topics: list[str] | None,
+    rate: float,
+    start_s: float,
+    loop: bool,
+    as_json: bool,
+) -> int:
+    """Publish the messages of a bag to a running graph; return the exit code 0.
 
     rate: playback speed relative to the recording. start_s: time in the bag at which playback
     starts.
     """
-
-    bag: Path
-    topics: tuple[str, ...]
-    rate: float
-    start_s: float
-    loop: bool
-    as_json: bool
-
-
-async def _play(request: PlayRequest, launch: Path | None, run_directory: Path | None) -> int:
-    from flexsheet.launch.plans.plan import load_graph
-    from flexsheet.launch.running.supervisor import RunningGraph
-
-    if launch is None:
-        plan, run = running_graph(run_directory)
-        return await _play_into(request, plan, run)
-    plan = load_graph(launch)
-    print_omitted(plan, None)
-    async with RunningGraph(plan) as graph:
-        with words.status(f"starting {launch}"):
-            await graph.wait_ready()
-        return await _play_into(request, plan, graph.run)
-
-
-async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int:
     from flexsheet.launch.bags.player import play as play_bag
     from flexsheet.launch.bags.player import select_topics
     from flexsheet.messages.bag import BagReader
 
-    selection = select_topics(BagReader(request.bag).topics, plan, request.topics)
+    selection = select_topics(BagReader(bag).topics, plan, tuple(topics or ()))
     for name, why in selection.left_out.items():
         words.print(f"not played: {name}: {why}")
     if not selection.topics:
         raise CommandError(
-            f"{request.bag}: contains no topic that can be played into {plan.launch_file}; "
+            f"{bag}: contains no topic that can be played into {plan.launch_file}; "
             "list the topics to play under external_topics there",
             FAILED,
         )
     sent = 0
     while True:
-        with progress_bar(f"playing {request.bag.name}") as progress:
+        with progress_bar(f"playing {bag.name}") as progress:
             sent += await play_bag(
-                request.bag,
-                plan,
-                run,
-                topics=selection.topics,
-                rate=request.rate,
-                start_s=request.start_s,
+                bag, plan, run, topics=selection.topics, rate=rate, start_s=start_s,
                 progress=progress,
-            )
-        if not request.loop:
+            )  # fmt: skip
+        if not loop:
             break
-    if request.as_json:
-        print_json({"bag": str(request.bag), "messages": sent, "topics": list(selection.topics)})
-    else:
-        words.print(f"played {sent} messages on {', '.join(selection.topics)}")
+    print_outcome(
+        {"bag": str(bag), "messages": sent, "topics": list(selection.topics)},
+        f"played {sent} messages on {', '.join(selection.topics)}",
+        as_json=as_json,
+    )
     return 0

@@ -1,41 +1,37 @@
 """`flexsheet calibrate`: calibrate a stereo camera with images of a calibration board.
 
-The module also contains the commands that check these calibrations, and functions that other
-calibration commands use.
+The module also contains functions that the calibrations of other devices use.
 """
 
 from __future__ import annotations
 
 import glob
+import math
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from datetime import datetime
+import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import (
-    JsonOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
-)
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_fields,
     print_json,
+    print_result,
     print_table,
+    progress_bar,
     words,
 )
 
 if TYPE_CHECKING:
     from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.calibration import Board, StereoCalibration
-    from flexsheet.messages.scene import Scene
+    from flexsheet.messages.scene import Pose, Scene
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Calibrate cameras, arms, projector and sheet."
@@ -64,6 +60,14 @@ MarkerOption = Annotated[
 ]
 DictionaryOption = Annotated[str, typer.Option(help="OpenCV dictionary of the ChArUco markers.")]
 FOUR_BITS = "DICT_4X4_50"
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        metavar="FILE",
+        help="Stereo calibration file; default: the camera of the scene.",
+    ),
+]
 
 
 @app.command(
@@ -78,7 +82,7 @@ def stereo(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, output_file("Stereo calibration file to write.")],
+    output: Annotated[Path, options.result_file("Stereo calibration file to write.")],
     left: LeftOption = "",
     right: RightOption = "",
     device_source: Annotated[
@@ -93,38 +97,25 @@ def stereo(
         Path | None,
         typer.Option(
             "--scene",
-            metavar="FILE",
-            help="Scene file that contains the image size and exposure time of the live camera.",
+            help="Scene file with the camera: its device name, image size, exposure time, and "
+            "distance from the screen.",
         ),
     ] = None,
     twin: Annotated[
-        Path | None,
-        typer.Option(metavar="SCENE", help="Simulate the camera of this scene file."),
+        Path | None, typer.Option(metavar="SCENE", help="Simulate the camera of this scene file.")
     ] = None,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
     pairs: Annotated[int, typer.Option(help="Number of image pairs to capture.", min=5)] = 20,
     pictures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="New folder for captured images.")
     ] = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    device: Annotated[
-        str | None,
-        typer.Option(help='Name of the stereo camera; default: from the scene, else "stereo".'),
-    ] = None,
-    distance_mm: Annotated[
-        float | None,
-        typer.Option(
-            help="Distance from the camera at which the measurement uncertainty is reported, mm; "
-            "default: from the scene or the board images.",
-            min=1.0,
-        ),
-    ] = None,
     report: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder to write a report with plots to.")
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate both cameras of a stereo camera and their relative pose.
 
@@ -137,15 +128,12 @@ def stereo(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.calibration import save_calibration
 
-    check_folder("-o", output)
     _check_single_source(left, right, device_source, twin)
     require_twin(apparatus, simulated=twin is not None)
-    described = _parse_board(board, square_mm, marker_mm, dictionary)
+    described = parse_board(board, square_mm, marker_mm, dictionary)
     scene: Scene | None = None
-    command = ["flexsheet", "calibrate", "stereo"]
     if left and right:
         left_paths, right_paths = _find_images("--left", left), _find_images("--right", right)
-        command += ["--left", left, "--right", right]
         scene = None if scene_file is None else load_scene(scene_file)
     else:
         camera_scene = twin or scene_file
@@ -162,29 +150,22 @@ def stereo(
         if device_source is None:
             true = load_true_devices(apparatus, scene)
             views = capture.simulate_views(scene, described, true, pairs=pairs, seed=seed)
-            command += ["--twin", str(camera_scene), "--pairs", str(pairs), "--seed", str(seed)]
-            command += [] if apparatus is None else ["--apparatus", apparatus]
         else:
             views = capture.read_device_views(device_source, scene)
-            command += ["--device-source", device_source, "--scene", str(camera_scene)]
         folder = pictures or Path(f"runs/calibration-{datetime.now():%Y%m%d-%H%M%S}")
         capture.write_pairs(views, pose_capture, folder)
         left_paths = sorted(folder.glob("left*.png"))
         right_paths = sorted(folder.glob("right*.png"))
-    command += ["--board", board, "--square-mm", f"{square_mm:g}"]
-    if marker_mm is not None:
-        command += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
-    command += ["-o", str(output)]
-    with _progress("detecting the board") as progress:
+    with progress_bar("detecting the board") as progress:
         calibrated = calibrate_stereo(
             left_paths,
             right_paths,
             board=described,
-            device=device or ("stereo" if scene is None else scene.camera.device),
-            working_distance_m=_working_distance_m(distance_mm, scene),
+            device="stereo" if scene is None else scene.camera.device,
+            working_distance_m=None if scene is None else measure_distance_m(scene),
             progress=progress,
         )
-    save_calibration(calibrated.calibration, output, comment=shlex.join(command))
+    save_calibration(calibrated.calibration, output, comment=command_line())
     page: Path | None = None
     if report is not None:
         from flexsheet.launch.calibration.report import write_report
@@ -196,16 +177,14 @@ def stereo(
 def _print_result(
     calibration: StereoCalibration, output: Path, page: Path | None, as_json: bool
 ) -> None:
-    used = sum(pair.used for pair in calibration.pairs)
-    baseline_mm = float((calibration.right_from_left[:3, 3] ** 2).sum() ** 0.5) * 1e3
     uncertainty = calibration.uncertainty
     assert uncertainty is not None
     result = {
         "calibration": str(output),
-        "pairs": used,
+        "pairs": sum(pair.used for pair in calibration.pairs),
         "pairs_left_out": {pair.left: pair.reason for pair in calibration.pairs if not pair.used},
         "reprojection_rms_px": calibration.reprojection_rms_px,
-        "baseline_mm": baseline_mm,
+        "baseline_mm": 1e3 * math.hypot(*calibration.right_from_left[:3, 3]),
         "left_f_px": calibration.left.fx_px,
         "right_f_px": calibration.right.fx_px,
         "uncertainty": {
@@ -216,28 +195,7 @@ def _print_result(
         },
         "report": None if page is None else str(page),
     }
-    if as_json:
-        print_json(result)
-        return
-    print_fields(
-        [
-            ("calibration", output),
-            ("pairs used", f"{used} of {len(calibration.pairs)}"),
-            ("reprojection", f"{calibration.reprojection_rms_px:.3f} px rms"),
-            ("baseline", f"{baseline_mm:.2f} mm"),
-            ("focal lengths", f"{calibration.left.fx_px:.1f}, {calibration.right.fx_px:.1f} px"),
-            (
-                "uncertainty",
-                f"{1e3 * uncertainty.depth_std_m:.2f} mm depth, "
-                f"{1e3 * uncertainty.lateral_std_m:.2f} mm lateral, "
-                f"at {1e3 * uncertainty.working_distance_m:.0f} mm",
-            ),
-            *([] if page is None else [("report", page)]),
-        ]
-    )
-    for pair in calibration.pairs:
-        if not pair.used:
-            words.print(f"excluded: {pair.left}: {pair.reason}")
+    print_result(result, as_json=as_json)
 
 
 @app.command(
@@ -255,18 +213,18 @@ def check(
     square_mm: SquareOption,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Check a calibration with images of a board that were not used to compute it."""
     from flexsheet.launch.calibration.check import check_stereo
     from flexsheet.messages.calibration import load_calibration
 
-    with _progress("measuring the board") as progress:
+    with progress_bar("measuring the board") as progress:
         result = check_stereo(
             load_calibration(calibration),
             _find_images("--left", left),
             _find_images("--right", right),
-            board=_parse_board(board, square_mm, marker_mm, dictionary),
+            board=parse_board(board, square_mm, marker_mm, dictionary),
             progress=progress,
         )
     reused = result["used_to_calibrate"]
@@ -275,10 +233,7 @@ def check(
             f"{', '.join(reused)}: these images were used to calibrate, so the errors are "
             "underestimated; use other images"
         )
-    if as_json:
-        print_json(result)
-    else:
-        print_fields((name, _format(value)) for name, value in result.items() if value != reused)
+    print_result(result, as_json=as_json)
 
 
 @app.command(
@@ -299,7 +254,7 @@ def cross_check(
     leave_out: Annotated[
         int, typer.Option(help="Number of image pairs that each calibration omits.", min=1)
     ] = 1,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Cross-validate a calibration with image pairs that were not used to compute it.
 
@@ -309,11 +264,11 @@ def cross_check(
     """
     from flexsheet.launch.calibration import check
 
-    with _progress("cross-validating") as progress:
+    with progress_bar("cross-validating") as progress:
         result = check.cross_check(
             _find_images("--left", left),
             _find_images("--right", right),
-            board=_parse_board(board, square_mm, marker_mm, dictionary),
+            board=parse_board(board, square_mm, marker_mm, dictionary),
             leave_out=leave_out,
             progress=progress,
         )
@@ -346,10 +301,10 @@ def print_board(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, output_file("Image file to write (.svg or .png).", "IMAGE")],
+    output: Annotated[Path, options.result_file("Image file to write (.svg or .png).", "IMAGE")],
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Write an image of a calibration board for printing at true size.
 
@@ -357,8 +312,7 @@ def print_board(
     """
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
-    check_folder("-o", output)
-    described = _parse_board(board, square_mm, marker_mm, dictionary)
+    described = parse_board(board, square_mm, marker_mm, dictionary)
     write_board(described, output)
     if as_json:
         print_json({"file": str(output), "board": described.model_dump(mode="json")})
@@ -392,7 +346,7 @@ def _find_images(option: str, pattern: str) -> list[Path]:
     return paths
 
 
-def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
+def parse_board(text: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
     from flexsheet.messages.calibration import Board
 
     columns, _, rows = text.lower().partition("x")
@@ -411,37 +365,62 @@ def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionar
     )
 
 
-def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
-    """Return the distance (m) at which the uncertainty is reported; None if it is not known.
+def measure_distance_m(scene: Scene) -> float:
+    """Return the distance (m) from the left camera to the centre of the screen."""
+    return math.hypot(*scene.camera.world_from_left.position_m)
 
-    If `distance_mm` is None, this is the distance from the left camera to the centre of the screen
-    in the scene.
+
+def command_line() -> str:
+    """Return the command line of this process, for the comment in a calibration file."""
+    return shlex.join(["flexsheet", *sys.argv[1:]])
+
+
+def make_provenance() -> dict[str, Any]:
+    """Return the date and the code version for a calibration file."""
+    from importlib.metadata import version
+
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"date": now, "code_version": version("flexsheet")}
+
+
+def write_scene_values(scene_file: Path, values: Mapping[str, Any], copy: Path) -> None:
+    """Write a copy of a scene file with other values; preserve comments and layout.
+
+    values: new values by the dotted path of the key. Raises BadInputError if the changed scene is
+    invalid.
     """
-    if distance_mm is not None:
-        return 1e-3 * distance_mm
-    if scene is None:
-        return None
-    return float((scene.camera.world_from_left.position_m**2).sum() ** 0.5)
+    from ruamel.yaml.comments import CommentedSeq
 
-
-@contextmanager
-def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
-    """Yield the YAML tree of a scene file; when the context ends, write the changed tree to `copy`.
-
-    Comments and layout are preserved. Raises BadInputError if the changed scene is invalid.
-    """
     from flexsheet.launch.plans.documents import edit_yaml
     from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.nodes.twin.tolerance_table import set_value
 
     with edit_yaml(scene_file, copy) as tree:
-        yield tree
+        for path, value in values.items():
+            if isinstance(value, list):
+                row = CommentedSeq(value)
+                row.fa.set_flow_style()
+                set_value(tree, path, row)
+            else:
+                set_value(tree, path, value)
     load_scene(copy)
 
 
-def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
-    """Load a stereo calibration and check that it fits the scene's camera.
+def pose_values(key: str, pose: Pose) -> dict[str, Any]:
+    """Return the position and the angles of a pose by their dotted paths in a scene file.
 
-    Returns None if `path` is None.
+    key: dotted path of the pose.
+    """
+    return {
+        f"{key}.position_m": [round_digits(one) for one in pose.position_m],
+        f"{key}.rpy_rad": [round_digits(one) for one in pose.rpy_rad],
+    }
+
+
+def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
+    """Load a stereo calibration of the scene's camera; return None if `path` is None.
+
+    Raises CommandError if the calibration belongs to another camera.
     """
     from flexsheet.messages.calibration import load_calibration, refuse_other_camera
     from flexsheet.messages.calibration_file import CalibrationMismatchError
@@ -465,10 +444,10 @@ def require_twin(apparatus: str | None, *, simulated: bool) -> None:
 def load_true_devices(
     text: str | None, scene: Scene, scene_file: Path | None = None
 ) -> Apparatus | None:
-    """Load the apparatus (true parameters) of the simulated hardware; return None if `text` is
-    None.
+    """Load the apparatus: the true parameters of the simulated hardware.
 
-    The returned parameters refer to the world frame of the stereo camera, as all calibrations do.
+    The parameters refer to the world frame of the stereo camera, as all calibrations do. Returns
+    None if `text` is None.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.nodes.twin.truth import align_world_to_camera
@@ -481,15 +460,3 @@ def load_true_devices(
 def round_digits(value: float) -> float:
     """Round a calibrated value (m, rad or px) to nine decimal places, and replace -0.0 by 0.0."""
     return round(float(value), 9) + 0.0
-
-
-@contextmanager
-def _progress(label: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show a progress bar on stderr, and yield its update function (done, total, text)."""
-    from rich.progress import Progress
-
-    with Progress(console=words.console, transient=True) as bar:
-        task = bar.add_task(label, total=None)
-        yield lambda done, total, text: bar.update(
-            task, completed=done, total=total, description=text
-        )

@@ -2,47 +2,38 @@
 
 from __future__ import annotations
 
-import math
-import shlex
-import shutil
-import sys
 import tempfile
-from datetime import UTC, datetime
-from importlib.metadata import version
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
     FOUR_BITS,
     BoardOption,
+    CalibrationOption,
     DictionaryOption,
     MarkerOption,
     SquareOption,
-    _parse_board,
-    _progress,
-    edit_scene,
+    app,
+    command_line,
     load_optics,
     load_true_devices,
+    make_provenance,
+    parse_board,
+    pose_values,
     require_twin,
-    round_digits,
+    write_scene_values,
 )
-from flexsheet.launch.commands.graph import run_interruptible
-from flexsheet.launch.commands.options import (
-    JsonOption,
-    RunOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
-)
+from flexsheet.launch.commands.graph import receiving, run_interruptible
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
-    print_fields,
-    print_json,
+    print_outcome,
+    print_result,
+    progress_bar,
     words,
 )
 
@@ -58,47 +49,23 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.types import Side
 
-CalibrationOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--calibration",
-        metavar="FILE",
-        help="Stereo calibration file; default: the camera of the scene.",
-    ),
-]
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands that calibrate the arms to `flexsheet calibrate`."""
-    app.command(
-        "arms",
-        epilog=examples(
-            "flexsheet calibrate arms --scene lab.yaml --left-arm places-left --right-arm "
-            "places-right --board 9x6 --square-mm 10 -o arms.yaml",
-            "flexsheet calibrate arms --scene launch/scenes/cylinder.yaml --twin --board 9x6 "
-            "--square-mm 10 -o arms.yaml",
-        ),
-    )(arms)
-    app.command(
-        "arms-capture",
-        epilog=examples(
-            "flexsheet calibrate arms-capture --arm left --scene lab.yaml --board 9x6 "
-            "--square-mm 10 -o places-left"
-        ),
-    )(capture)
-    app.command(
-        "arms-scene",
-        epilog=examples("flexsheet calibrate arms-scene arms.yaml lab.yaml -o lab-measured.yaml"),
-    )(write_scene)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate arms --scene lab.yaml --left-arm places-left --right-arm "
+        "places-right --board 9x6 --square-mm 10 -o arms.yaml",
+        "flexsheet calibrate arms --scene launch/scenes/cylinder.yaml --twin --board 9x6 "
+        "--square-mm 10 -o arms.yaml",
+    ),
+)
 def arms(
     *,
-    scene_file: SceneOption,
+    scene_file: options.SceneOption,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, output_file("Arm calibration file to write.")],
+    output: Annotated[Path, options.result_file("Arm calibration file to write.")],
     left_arm: Annotated[
         Path | None,
         typer.Option(
@@ -115,8 +82,8 @@ def arms(
         bool, typer.Option("--twin", help="Calibrate simulated arms instead of recorded poses.")
     ] = False,
     places: Annotated[int, typer.Option(help="Number of simulated poses per arm.", min=6)] = 16,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
@@ -124,11 +91,11 @@ def arms(
         Path | None,
         typer.Option(
             "--write-scene",
-            metavar="FILE",
             help="Copy of the scene to write, with the measured base poses.",
+            callback=options.check_folder,
         ),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the poses of the arm bases in the world frame of the stereo camera.
 
@@ -139,7 +106,6 @@ def arms(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import save_arms_calibration
 
-    check_folder("-o", output)
     if twin == (left_arm is not None or right_arm is not None):
         raise CommandError("give either --twin, or --left-arm, --right-arm or both")
     require_twin(apparatus, simulated=twin)
@@ -147,28 +113,24 @@ def arms(
         _check_new_file(copy, "--write-scene")
     scene = load_scene(scene_file)
     true = load_true_devices(apparatus, scene)
-    described = _parse_board(board, square_mm, marker_mm, dictionary)
+    described = parse_board(board, square_mm, marker_mm, dictionary)
     optics = load_optics(calibration, scene)
     folders: dict[Side, Path | None] = {"left": left_arm, "right": right_arm}
     fits: dict[Side, BaseFit] = {}
     blind: dict[Side, list[tuple[str, str]]] = {}
-    simulated = Path(tempfile.mkdtemp(prefix="flexsheet-arms-")) if twin else None
-    try:
+    with tempfile.TemporaryDirectory(prefix="flexsheet-arms-") as simulated:
         for side in SIDES:
-            if simulated is not None:
+            if twin:
                 folders[side] = simulate_folder(
-                    scene, described, side, true, folder=simulated, places=places, seed=seed
+                    scene, described, side, true, folder=Path(simulated), places=places, seed=seed
                 )
             folder = folders[side]
             if folder is not None:
                 fits[side], blind[side] = fit_folder(folder, described, scene, optics, side)
-    finally:
-        if simulated is not None:
-            shutil.rmtree(simulated)
     measured = make_calibration(fits, scene, described)
-    save_arms_calibration(measured, output, comment=shlex.join(["flexsheet", *sys.argv[1:]]))
+    save_arms_calibration(measured, output, comment=command_line())
     if copy is not None:
-        _write_copy(scene_file, measured, copy)
+        write_scene_values(scene_file, list_scene_values(measured), copy)
     truth = (
         {side: _true_errors(scene, side, fits[side], true, seed) for side in fits} if twin else {}
     )
@@ -177,13 +139,15 @@ def arms(
     )
 
 
+@app.command(
+    "arms-scene",
+    epilog=examples("flexsheet calibrate arms-scene arms.yaml lab.yaml -o lab-measured.yaml"),
+)
 def write_scene(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION", help="Arm calibration file.")
-    ],
+    calibration: Annotated[Path, typer.Argument(help="Arm calibration file.")],
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to copy.")],
-    output: Annotated[Path, output_file("Scene file to write.")],
-    as_json: JsonOption = False,
+    output: Annotated[Path, options.result_file("Scene file to write.")],
+    as_json: options.JsonOption = False,
 ) -> None:
     """Write a copy of a scene file with the base poses of an arm calibration."""
     from flexsheet.launch.plans.plan import load_scene
@@ -191,13 +155,17 @@ def write_scene(
 
     _check_new_file(output, "-o")
     load_scene(scene_file)
-    _write_copy(scene_file, load_arms_calibration(calibration), output)
-    if as_json:
-        print_json({"scene": str(output)})
-    else:
-        words.print(f"scene: {output}")
+    write_scene_values(scene_file, list_scene_values(load_arms_calibration(calibration)), output)
+    print_outcome({"scene": str(output)}, f"scene: {output}", as_json=as_json)
 
 
+@app.command(
+    "arms-capture",
+    epilog=examples(
+        "flexsheet calibrate arms-capture --arm left --scene lab.yaml --board 9x6 "
+        "--square-mm 10 -o places-left"
+    ),
+)
 def capture(
     *,
     side: Annotated[
@@ -214,15 +182,15 @@ def capture(
             "-o", "--output", metavar="FOLDER", help="New folder for joints.csv and board images."
         ),
     ],
-    scene_file: SceneOption,
+    scene_file: options.SceneOption,
     places: Annotated[
         int, typer.Option(help="Number of poses to record; then the command stops.", min=1)
     ] = 20,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Record joint angles and board images for `calibrate arms`, from the running graph.
 
@@ -235,7 +203,7 @@ def capture(
     if side not in SIDES:
         raise CommandError(f"--arm {side}: unknown arm; give left or right")
     scene = load_scene(scene_file)
-    described = _parse_board(board, square_mm, marker_mm, dictionary)
+    described = parse_board(board, square_mm, marker_mm, dictionary)
     try:
         output.mkdir(parents=True)
     except OSError as error:
@@ -253,10 +221,11 @@ def capture(
     run_interruptible(
         record_poses(recorder, on_arm, [f"arm_{side}"], size=size, places=places, run=run)
     )
-    if as_json:
-        print_json({"folder": str(output), "poses": recorder.count})
-    else:
-        words.print(f"{recorder.count} poses in {output}")
+    print_outcome(
+        {"folder": str(output), "poses": recorder.count},
+        f"{recorder.count} poses in {output}",
+        as_json=as_json,
+    )
 
 
 async def record_poses(
@@ -293,9 +262,7 @@ async def record_poses(
     subscribers = [make_listener(TOPICS["stereo"], run, on_stereo)]
     subscribers += [make_listener(TOPICS[name], run, on_state) for name in arms]
     printed = ""
-    try:
-        for subscriber in subscribers:
-            subscriber.start()
+    with receiving(subscribers):
         while recorder.count < places:
             pair, time_s = await images.get()
             if (pair.left.shape[1], pair.left.shape[0]) != size or any(pair.left_origin_px):
@@ -307,16 +274,12 @@ async def record_poses(
             if hint != printed:
                 words.print(hint)
             printed = hint
-    finally:
-        for subscriber in subscribers:
-            subscriber.close()
     return 0
 
 
 def _check_new_file(path: Path, option: str) -> None:
     if path.exists():
         raise CommandError(f"{option} {path}: the file exists; name a new file")
-    check_folder(option, path)
 
 
 def simulate_folder(
@@ -334,11 +297,11 @@ def simulate_folder(
 
     poses = folder / side
     poses.mkdir()
-    with _progress(f"simulating the {side} arm") as progress:
+    with progress_bar(f"simulating the {side} arm") as progress:
         for done in simulate_poses(
             scene, board, side, poses, places=places, seed=seed, apparatus=apparatus
         ):
-            progress(done, places, f"simulating the {side} arm")
+            progress(done, places)
     return poses
 
 
@@ -352,7 +315,7 @@ def fit_folder(
     size = (scene.camera.width_px, scene.camera.height_px)
     detections: list[BoardDetection]
     try:
-        with _progress(f"{side} arm: detecting the board") as progress:
+        with progress_bar(f"{side} arm: detecting the board") as progress:
             detections, blind = read_detections(folder, board, rig, size, progress)
         with words.status(f"{side} arm: fitting"):
             return calibrate_base(detections, rig, getattr(scene.arms, side).model), blind
@@ -364,8 +327,7 @@ def make_calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> A
     from flexsheet.messages.arms_calibration import ArmsCalibration
 
     return ArmsCalibration(
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        code_version=version("flexsheet"),
+        **make_provenance(),
         scene=scene.name,
         device=scene.camera.device,
         board=board,
@@ -400,30 +362,17 @@ def _make_arm_base(fit: BaseFit) -> ArmBase:
         corner_sigma_px=fit.corner_sigma_px,
         arm_sigma_m=fit.arm_sigma_m,
         arm_sigma_rad=fit.arm_sigma_rad,
-        poses=tuple(
-            ArmPoseFit(
-                name=one.name,
-                used=not one.reason,
-                reason=one.reason,
-                shift_m=one.shift_m,
-                rotation_rad=one.rotation_rad,
-                rms_px=one.rms_px,
-            )
-            for one in fit.residuals
-        ),
+        poses=tuple(ArmPoseFit(used=not one.reason, **asdict(one)) for one in fit.residuals),
     )
 
 
-def _write_copy(scene_file: Path, measured: ArmsCalibration, copy: Path) -> None:
-    with edit_scene(scene_file, copy) as tree:
-        for side in SIDES:
-            base: ArmBase | None = getattr(measured, side)
-            if base is None:
-                continue
-            target = tree["arms"][side]["world_from_base"]
-            for key in ("position_m", "rpy_rad"):
-                for index, value in enumerate(getattr(base.world_from_base, key)):
-                    target[key][index] = round_digits(value)
+def list_scene_values(measured: ArmsCalibration) -> dict[str, Any]:
+    """Return the calibrated poses of the arm bases, by their dotted paths in a scene file."""
+    values: dict[str, Any] = {}
+    for side, base in (("left", measured.left), ("right", measured.right)):
+        if base is not None:
+            values |= pose_values(f"arms.{side}.world_from_base", base.world_from_base)
+    return values
 
 
 def _true_errors(
@@ -465,91 +414,24 @@ def _print_result(
         "scene": None if copy is None else str(copy),
         "arms": {},
     }
-    lines = []
-    for side in SIDES:
-        base: ArmBase | None = getattr(measured, side)
-        if base is None:
-            continue
-        lines += [f"  {side}:", f"    world_from_base: {_format_pose(base)}"]
+    for side, without_board in blind.items():
+        base: ArmBase = getattr(measured, side)
         outliers = [(one.name, one.reason) for one in base.poses if not one.used]
-        for name, reason in [*blind[side], *outliers]:
-            words.print(f"{side} arm, excluded {name}: {reason}")
         moved_m, turned_rad = _compute_shift(base, scene, side)
         result["arms"][side] = {
-            "world_from_base": base.world_from_base.model_dump(mode="json"),
-            "position_std_m": base.position_std_m,
-            "rotation_std_rad": base.rotation_std_rad,
+            **base.model_dump(mode="json", exclude={"flange_from_board", "covariance", "poses"}),
             "moved_from_scene_m": moved_m,
             "rotation_from_scene_rad": turned_rad,
             "poses_used": sum(one.used for one in base.poses),
-            "poses": len(base.poses) + len(blind[side]),
-            "left_out": dict([*blind[side], *outliers]),
-            "jackknife_ratio": base.jackknife_ratio,
-            "max_change_m": base.max_change_m,
-            "max_change_rad": base.max_change_rad,
-            "corner_sigma_px": base.corner_sigma_px,
-            "arm_sigma_m": base.arm_sigma_m,
-            "arm_sigma_rad": base.arm_sigma_rad,
+            "poses": len(base.poses) + len(without_board),
+            "left_out": dict([*without_board, *outliers]),
             **truth.get(side, {}),
         }
-    if as_json:
-        print_json(result)
-        return
-    print_fields([("calibration", output), *([] if copy is None else [("scene", copy)])])
-    for side, one in result["arms"].items():
-        print()
-        print_fields(_list_fields(side, one))
-    if copy is None:
-        print("\narms:\n" + "\n".join(lines))
-
-
-def _list_fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = [
-        (f"{side} arm", f"{one['poses_used']} of {one['poses']} poses used"),
-        (
-            "uncertainty",
-            f"standard deviation {1e3 * one['position_std_m']:.2f} mm at the screen's centre, "
-            f"{math.degrees(one['rotation_std_rad']):.3f} degrees",
-        ),
-        (
-            "shift from scene",
-            f"{1e3 * one['moved_from_scene_m']:.1f} mm, "
-            f"{math.degrees(one['rotation_from_scene_rad']):.2f} degrees",
-        ),
-        (
-            "leave-one-out",
-            f"omitting one pose moves the base by up to {1e3 * one['max_change_m']:.2f} mm, "
-            f"{math.degrees(one['max_change_rad']):.3f} degrees; "
-            f"jackknife ratio {one['jackknife_ratio']:.2f}",
-        ),
-        ("corners", f"{one['corner_sigma_px']:.3f} px"),
-        (
-            "arm positioning error",
-            f"{1e3 * one['arm_sigma_m']:.2f} mm, {math.degrees(one['arm_sigma_rad']):.3f} degrees",
-        ),
-    ]
-    if "true_error_m" in one:
-        rows.append(
-            (
-                "true error",
-                f"{1e3 * one['true_error_m']:.2f} mm at the screen's centre, "
-                f"{math.degrees(one['true_error_rad']):.3f} degrees",
-            )
-        )
-    return rows
-
-
-def _format_pose(base: ArmBase) -> str:
-    position, rpy = (
-        ", ".join(repr(round_digits(value)) for value in values)
-        for values in (base.world_from_base.position_m, base.world_from_base.rpy_rad)
-    )
-    return f"{{position_m: [{position}], rpy_rad: [{rpy}]}}"
+    print_result(result, as_json=as_json)
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return the distance (m) and angle (rad) between an arm's base poses in scene and
-    calibration."""
+    """Return the distance (m) and the angle (rad) of a calibrated base from that in the scene."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation

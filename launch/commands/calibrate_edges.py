@@ -7,70 +7,58 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
-    edit_scene,
+    CalibrationOption,
+    app,
     load_optics,
     load_true_devices,
+    pose_values,
     require_twin,
     round_digits,
+    write_scene_values,
 )
-from flexsheet.launch.commands.calibrate_arms import CalibrationOption, record_poses
+from flexsheet.launch.commands.calibrate_arms import record_poses
 from flexsheet.launch.commands.graph import run_interruptible
-from flexsheet.launch.commands.options import (
-    CYLINDER,
-    JsonOption,
-    RunOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
-)
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
-    print_fields,
-    print_json,
-    words,
+    print_outcome,
+    print_result,
 )
 
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.edge_fit import EdgeFit
     from flexsheet.messages.types import Side
 
-
-def register(app: typer.Typer) -> None:
-    """Add the commands that calibrate the sheet's edges to `flexsheet calibrate`."""
-    app.command(
-        "edges",
-        epilog=examples(
-            "flexsheet calibrate edges --rows marks.csv --scene lab.yaml -o measured.yaml",
-            "flexsheet calibrate edges --twin --apparatus seed:3 "
-            "--calibration launch/calibrations/twin-bumblebee.yaml -o measured.yaml",
-        ),
-    )(edges)
-    app.command("edges-capture", epilog=examples("flexsheet calibrate edges-capture -o marks.csv"))(
-        edges_capture
-    )
+POSES = 24
+"""The number of poses after which `calibrate edges-capture` stops."""
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate edges --rows marks.csv --scene lab.yaml -o measured.yaml",
+        "flexsheet calibrate edges --twin --apparatus seed:3 "
+        "--calibration launch/calibrations/twin-bumblebee.yaml -o measured.yaml",
+    ),
+)
 def edges(
     *,
-    output: Annotated[Path, output_file("Copy of the scene file with the measured arms.")],
+    output: Annotated[Path, options.result_file("Copy of the scene file with the measured arms.")],
     rows: Annotated[
         Path | None,
         typer.Option(
             metavar="CSV", help="CSV file of measured marks, from `calibrate edges-capture`."
         ),
     ] = None,
-    scene_file: SceneOption = CYLINDER,
+    scene_file: options.SceneOption = options.CYLINDER,
     twin: Annotated[
         bool, typer.Option("--twin", help="Simulate the marks instead of reading a file.")
     ] = False,
-    apparatus: TwinApparatusOption = None,
+    apparatus: options.TwinApparatusOption = None,
     calibration: CalibrationOption = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure where the arms hold the sheet, from camera images of marks on the clamps.
 
@@ -82,7 +70,6 @@ def edges(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.apparatus import nominal_apparatus
 
-    check_folder("-o", output)
     if twin == (rows is not None):
         raise CommandError("give exactly one source of marks: --rows CSV or --twin")
     require_twin(apparatus, simulated=twin)
@@ -97,72 +84,48 @@ def edges(
         fits = fit_edges(poses, scene)
     except EdgeFitError as error:
         raise CommandError(f"{rows or scene_file}: {error}; {error.remedy}") from error
-    _write_scene(scene_file, fits, output)
-    _print_result(fits, output, as_json=as_json)
-
-
-def _write_scene(scene_file: Path, fits: dict[Side, EdgeFit], copy: Path) -> None:
-    with edit_scene(scene_file, copy) as tree:
-        for side, fit in fits.items():
-            target = tree["arms"][side]
-            for name in ("world_from_base", "flange_from_edge"):
-                pose = getattr(fit.arm, name)
-                for key in ("position_m", "rpy_rad"):
-                    for index, value in enumerate(getattr(pose, key)):
-                        target[name][key][index] = round_digits(value)
-            target["joint_offsets_rad"] = [round_digits(one) for one in fit.arm.joint_offsets_rad]
-            target["flange_compliance_m_per_n"] = round_digits(fit.arm.flange_compliance_m_per_n)
-
-
-def _print_result(fits: dict[Side, EdgeFit], output: Path, *, as_json: bool) -> None:
-    if as_json:
-        found = {
-            side: {
-                "marks": fit.marks,
-                "poses": fit.poses,
-                "residual_rms_m": fit.residual_rms_m,
-                "edge_std_m": fit.edge_std_m,
-                "joint_offsets_rad": fit.arm.joint_offsets_rad,
-                "flange_compliance_m_per_n": fit.arm.flange_compliance_m_per_n,
-                "compliance_std_m_per_n": fit.compliance_std_m_per_n,
-            }
-            for side, fit in fits.items()
+    write_scene_values(scene_file, list_scene_values(fits), output)
+    found = {
+        side: {
+            "marks": fit.marks,
+            "poses": fit.poses,
+            "residual_rms_m": fit.residual_rms_m,
+            "edge_std_m": fit.edge_std_m,
+            "joint_offsets_rad": fit.arm.joint_offsets_rad,
+            "flange_compliance_m_per_n": fit.arm.flange_compliance_m_per_n,
+            "compliance_std_m_per_n": fit.compliance_std_m_per_n,
         }
-        print_json({"scene": str(output), "arms": found})
-        return
-    print_fields([("scene", output)])
+        for side, fit in fits.items()
+    }
+    print_result({"scene": str(output), "arms": found}, as_json=as_json)
+
+
+def list_scene_values(fits: dict[Side, EdgeFit]) -> dict[str, Any]:
+    """Return the fitted parameters of both arms, by their dotted paths in a scene file."""
+    values: dict[str, Any] = {}
     for side, fit in fits.items():
-        print()
-        compliance = 1e6 * fit.arm.flange_compliance_m_per_n
-        print_fields(
-            [
-                (f"{side} arm", f"{fit.marks} marks in {fit.poses} poses"),
-                ("residual", f"{1e3 * fit.residual_rms_m:.3f} mm rms"),
-                ("uncertainty of the edge", f"{1e3 * fit.edge_std_m:.3f} mm"),
-                (
-                    "compliance of the flange",
-                    f"{compliance:.0f} ± {1e6 * fit.compliance_std_m_per_n:.0f} µm/N",
-                ),
-            ]
-        )
+        arm, key = fit.arm, f"arms.{side}"
+        values |= pose_values(f"{key}.world_from_base", arm.world_from_base)
+        values |= pose_values(f"{key}.flange_from_edge", arm.flange_from_edge)
+        values[f"{key}.joint_offsets_rad"] = [round_digits(one) for one in arm.joint_offsets_rad]
+        values[f"{key}.flange_compliance_m_per_n"] = round_digits(arm.flange_compliance_m_per_n)
+    return values
 
 
+@app.command("edges-capture", epilog=examples("flexsheet calibrate edges-capture -o marks.csv"))
 def edges_capture(
     *,
-    output: Annotated[Path, output_file("New CSV file for the marks.")],
-    scene_file: SceneOption = CYLINDER,
-    poses: Annotated[
-        int, typer.Option(help="Number of poses after which the command stops.", min=1)
-    ] = 24,
+    output: Annotated[Path, options.output_file("New CSV file for the marks.")],
+    scene_file: options.SceneOption = options.CYLINDER,
     calibration: CalibrationOption = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Record marks on both clamps for `calibrate edges`, from the running graph.
 
     Fix three bright marks on each clamp: one at its centre, and two at 45 % of its length above and
     below the centre. Move the sheet to poses that differ in position, rotation and stretch. The
-    command records a pose when both arms are at rest. Ctrl-C ends the recording.
+    command records a pose when both arms are at rest, and stops after 24 poses or at Ctrl-C.
     """
     from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene
@@ -180,9 +143,10 @@ def edges_capture(
         recorder.update_joints(state.side, state.joints_rad, time_s)
 
     run_interruptible(
-        record_poses(recorder, on_arm, ["arm_left", "arm_right"], size=size, places=poses, run=run)
+        record_poses(recorder, on_arm, ["arm_left", "arm_right"], size=size, places=POSES, run=run)
     )
-    if as_json:
-        print_json({"rows": str(output), "poses": recorder.count})
-    else:
-        words.print(f"{recorder.count} poses in {output}")
+    print_outcome(
+        {"rows": str(output), "poses": recorder.count},
+        f"{recorder.count} poses in {output}",
+        as_json=as_json,
+    )

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import shlex
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.calibrate import load_true_devices
-from flexsheet.launch.commands.options import (
-    CYLINDER,
-    JsonOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
+from flexsheet.launch.commands import options
+from flexsheet.launch.commands.calibrate import (
+    app,
+    command_line,
+    load_true_devices,
+    make_provenance,
 )
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
-    print_fields,
-    print_json,
+    print_result,
 )
 
 if TYPE_CHECKING:
@@ -33,21 +26,16 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `marker` to `flexsheet calibrate`."""
-    app.command(
-        "marker",
-        epilog=examples(
-            "flexsheet calibrate marker --rows touches.csv --scene lab.yaml -o marker.yaml",
-            "flexsheet calibrate marker --twin launch/scenes/cylinder.yaml --apparatus seed:3 "
-            "-o marker.yaml",
-        ),
-    )(marker)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate marker --rows touches.csv --scene lab.yaml -o marker.yaml",
+        "flexsheet calibrate marker --twin launch/scenes/cylinder.yaml --apparatus seed:3 "
+        "-o marker.yaml",
+    ),
+)
 def marker(
     *,
-    output: Annotated[Path, output_file("Marker calibration file to write.")],
+    output: Annotated[Path, options.result_file("Marker calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -55,20 +43,18 @@ def marker(
             help="CSV file of touches of known points; docs/set-up-marker.md lists its columns.",
         ),
     ] = None,
-    scene_file: SceneOption = CYLINDER,
+    scene_file: options.SceneOption = options.CYLINDER,
     twin: Annotated[
         Path | None,
         typer.Option(metavar="SCENE", help="Simulate the touches with the finger of this scene."),
     ] = None,
-    apparatus: TwinApparatusOption = None,
+    apparatus: options.TwinApparatusOption = None,
     calibration_file: Annotated[
         Path | None,
-        typer.Option(
-            "--calibration", metavar="FILE", help="With --twin: stereo calibration of the camera."
-        ),
+        typer.Option("--calibration", help="With --twin: stereo calibration of the camera."),
     ] = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Determine the position of the marker relative to the finger pad, which touches the sheet.
 
@@ -81,17 +67,14 @@ def marker(
     from flexsheet.messages.calibration import load_calibration
     from flexsheet.messages.marker_calibration import save_marker_calibration
 
-    check_folder("-o", output)
     if (rows is None) == (twin is None):
         raise CommandError("give exactly one source of touches: --rows CSV or --twin SCENE")
     for name, value in (("--apparatus", apparatus), ("--calibration", calibration_file)):
         if value is not None and twin is None:
             raise CommandError(f"{name} {value}: the option is for --twin SCENE only; remove it")
-    command = ["flexsheet", "calibrate", "marker"]
     if rows is not None:
         scene = load_scene(scene_file)
         touches = read_touches(rows, scene)
-        command += ["--rows", str(rows), "--scene", str(scene_file)]
         source = str(rows)
     else:
         assert twin is not None
@@ -99,13 +82,11 @@ def marker(
         true = load_true_devices(apparatus, scene) or nominal_apparatus(scene)
         optics = None if calibration_file is None else load_calibration(calibration_file)
         touches = simulate_touches(scene, true, calibration=optics, seed=seed)
-        command += ["--twin", str(twin), "--seed", str(seed)]
-        command += [] if apparatus is None else ["--apparatus", apparatus]
-        command += [] if calibration_file is None else ["--calibration", str(calibration_file)]
         source = f"twin of {scene.name}"
     calibration = make_calibration(touches, scene, source)
-    save_marker_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
-    _print_result(calibration, output, as_json)
+    save_marker_calibration(calibration, output, comment=command_line())
+    values = calibration.model_dump(mode="json")
+    print_result({"calibration": str(output), **values}, as_json=as_json)
 
 
 def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerCalibration:
@@ -122,8 +103,7 @@ def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerC
     except MarkerFitError as error:
         raise CommandError(f"{source}: {error}; {error.remedy}") from error
     return MarkerCalibration(
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        code_version=version("flexsheet"),
+        **make_provenance(),
         source=source,
         scene=scene.name,
         marker_from_pad_m=tuple(fit.marker_from_pad_m.tolist()),
@@ -135,31 +115,4 @@ def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerC
         touches=len(touches),
         points=fit.points,
         orientations=fit.orientations,
-    )
-
-
-def _print_result(calibration: MarkerCalibration, output: Path, as_json: bool) -> None:
-    if as_json:
-        values = calibration.model_dump(mode="json")
-        print_json({"calibration": str(output), **values})
-        return
-    offsets = zip(calibration.marker_from_pad_m, calibration.standard_deviations_m, strict=True)
-    print_fields(
-        [
-            ("calibration", output),
-            (
-                "touches",
-                f"{calibration.touches} of {calibration.points} points in "
-                f"{calibration.orientations} orientations",
-            ),
-            *(
-                (f"marker from pad, {axis}", f"{1e3 * value:.2f} ± {1e3 * deviation:.2f} mm")
-                for axis, (value, deviation) in zip("xyz", offsets, strict=True)
-            ),
-            (
-                "residuals",
-                f"{1e3 * calibration.residual_rms_m:.2f} mm rms, "
-                f"{1e3 * calibration.max_residual_m:.2f} mm max",
-            ),
-        ]
     )

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
-    edit_scene,
+    CalibrationOption,
+    app,
     load_optics,
     load_true_devices,
+    pose_values,
     require_twin,
     round_digits,
-)
-from flexsheet.launch.commands.options import (
-    JsonOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
+    write_scene_values,
 )
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
-    print_fields,
     print_json,
+    print_result,
     words,
 )
 from flexsheet.messages.files import write_file
@@ -42,34 +38,26 @@ if TYPE_CHECKING:
     Views = tuple[list[Image], list[Image]]
 
 VOLUME_HALF_M = 0.1
+TWIN_POSES = 6
+"""The number of simulated poses of the sheet."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `projector` to `flexsheet calibrate`."""
-    app.command(
-        "projector",
-        epilog=examples(
-            "flexsheet calibrate projector --scene lab.yaml --write-patterns patterns",
-            "flexsheet calibrate projector --scene lab.yaml --pictures poses -o lab-measured.yaml",
-            "flexsheet calibrate projector --scene lab.yaml --corners '599,499 199,499 199,99 "
-            "599,99' --rectangle-mm 200x200",
-        ),
-    )(projector)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate projector --scene lab.yaml --write-patterns patterns",
+        "flexsheet calibrate projector --scene lab.yaml --pictures poses -o lab-measured.yaml",
+        "flexsheet calibrate projector --scene lab.yaml --corners '599,499 199,499 199,99 "
+        "599,99' --rectangle-mm 200x200",
+    ),
+)
 def projector(
     *,
-    scene_file: SceneOption,
+    scene_file: options.SceneOption,
     output: Annotated[
         Path | None,
-        output_file("Scene file to write with the result; may be the file of --scene."),
+        options.result_file("Scene file to write with the result; may be the file of --scene."),
     ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Stereo calibration file; default: the camera of the scene."
-        ),
-    ] = None,
+    calibration: CalibrationOption = None,
     write_patterns: Annotated[
         Path | None,
         typer.Option(
@@ -106,10 +94,9 @@ def projector(
             "--twin", help="Calibrate a simulated projector that deviates from the scene."
         ),
     ] = False,
-    poses: Annotated[int, typer.Option(min=3, help="Number of sheet poses for --twin.")] = 6,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate pose and lens of the projector, and write the result into a scene.
 
@@ -118,10 +105,7 @@ def projector(
     simulated.
     """
     from flexsheet.launch.calibration import gray_code
-    from flexsheet.launch.calibration.projector import (
-        calibrate_projector,
-        measure_points,
-    )
+    from flexsheet.launch.calibration.projector import calibrate_projector, measure_points
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
@@ -138,8 +122,6 @@ def projector(
             "the patterns with --write-patterns FOLDER"
         )
     require_twin(apparatus, simulated=twin)
-    if output is not None:
-        check_folder("-o", output)
     true: Projector | None = None
     if corners is not None:
         fit = _fit_corners(scene, corners, rectangle_mm)
@@ -153,7 +135,7 @@ def projector(
                 true = make_true_projector(require_projector(scene), seed=seed)
             else:
                 true = require_projector(apply_apparatus(scene, devices))
-            views = list(simulate_views(scene, true, devices, poses, seed))
+            views = list(simulate_views(scene, true, devices, TWIN_POSES, seed))
         else:
             assert pictures is not None
             views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
@@ -162,7 +144,7 @@ def projector(
             measure_points(views, camera, require_projector(scene)), require_projector(scene)
         )
     if output is not None:
-        write_scene(scene_file, fit.projector, output)
+        write_scene_values(scene_file, list_scene_values(fit.projector), output)
     _print_result(scene, fit, true, output, as_json=as_json)
 
 
@@ -230,8 +212,10 @@ def simulate_views(
 
 
 def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
-    """Return the stereo camera of the scene, with the lenses and baseline of a calibration if
-    given."""
+    """Return the stereo camera of the scene.
+
+    If a calibration is given, the camera has the calibrated lenses and baseline.
+    """
     optics = load_optics(calibration, scene)
     if optics is None:
         return scene.camera
@@ -262,30 +246,18 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, require_projector(scene))
 
 
-def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
-    """Write a copy of a scene file with another projector; preserve comments and layout."""
-    with edit_scene(scene_file, copy) as tree:
-        lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
-        for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
-            lens[key] = round_digits(getattr(projector.lens, key))
-        if any(projector.lens.distortion) or "distortion" in lens:
-            lens["distortion"] = _make_flow_list(projector.lens.distortion)
-        for key in ("position_m", "rpy_rad"):
-            pose[key] = _make_flow_list(getattr(projector.world_from_projector, key))
-
-
-def _make_flow_list(values: Iterable[float]) -> Any:
-    from ruamel.yaml.comments import CommentedSeq
-
-    row = CommentedSeq([round_digits(value) for value in values])
-    row.fa.set_flow_style()
-    return row
+def list_scene_values(projector: Projector) -> dict[str, Any]:
+    """Return the pose and the lens of a projector, by their dotted paths in a scene file."""
+    values = pose_values("projector.world_from_projector", projector.world_from_projector)
+    for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
+        values[f"projector.lens.{key}"] = round_digits(getattr(projector.lens, key))
+    values["projector.lens.distortion"] = [round_digits(k) for k in projector.lens.distortion]
+    return values
 
 
 def _print_result(
     scene: Scene, fit: ProjectorFit, true: Projector | None, output: Path | None, *, as_json: bool
 ) -> None:
-    held_out = None if fit.held_out_rms_px != fit.held_out_rms_px else fit.held_out_rms_px
     lens, pose = fit.projector.lens, fit.projector.world_from_projector
     result: dict[str, Any] = {
         "scene": None if output is None else str(output),
@@ -294,50 +266,22 @@ def _print_result(
         "outliers": fit.outliers,
         "rms_px": fit.rms_px,
         "rms_mm": 1e3 * fit.rms_m,
-        "held_out_rms_px": held_out,
+        "held_out_rms_px": fit.held_out_rms_px,
         "before_rms_px": fit.before_rms_px,
         "coverage_ratio": fit.coverage_ratio,
         "depth_range_mm": 1e3 * fit.depth_range_m,
         "lens": lens.model_dump(),
-        "position_m": [float(value) for value in pose.position_m],
-        "rpy_rad": [float(value) for value in pose.rpy_rad],
+        **pose.model_dump(mode="json"),
     }
     if true is not None:
         result["eye_error_mm"] = _eye_errors_mm(scene, fit.projector, true)
-        result["make_true_projector"] = {
-            "width_px": true.width_px,
-            "height_px": true.height_px,
-            "lens": true.lens.model_dump(),
-            "world_from_projector": {
-                "position_m": true.world_from_projector.position_m.tolist(),
-                "rpy_rad": true.world_from_projector.rpy_rad.tolist(),
-            },
-        }
-    if as_json:
-        print_json(result)
-        return
-    held_out_text = "-" if held_out is None else f"{held_out:.2f} px rms"
-    print_fields(
-        [
-            ("scene", "not written (no -o FILE)" if output is None else output),
-            ("points", f"{fit.points} in {fit.poses} poses, {fit.outliers} outliers excluded"),
-            ("before", f"{fit.before_rms_px:.2f} px rms"),
-            ("after", f"{fit.rms_px:.2f} px rms, {1e3 * fit.rms_m:.2f} mm on the sheet"),
-            ("held-out poses", held_out_text),
-            ("coverage", f"{100 * fit.coverage_ratio:.0f} % of the image"),
-            ("depth", f"{1e3 * fit.depth_range_m:.0f} mm along the projection"),
-        ]
-    )
-    for when, error in result.get("eye_error_mm", {}).items():
-        words.print(
-            f"true image error at the eye {when} the calibration: {error['mean']:.3f} mm mean, "
-            f"{error['max']:.3f} mm max"
-        )
+        shown = {"width_px", "height_px", "lens", "world_from_projector"}
+        result["true_projector"] = true.model_dump(mode="json", include=shown)
+    print_result(result, as_json=as_json)
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the mean and maximum image errors (mm) that the eye sees, before and after
-    calibration.
+    """Return mean and maximum image errors (mm) at the eye, before and after calibration.
 
     fitted: calibrated projector. true: simulated projector.
     """

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import shlex
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.calibrate import load_true_devices, require_twin
-from flexsheet.launch.commands.options import (
-    CYLINDER,
-    JsonOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
+from flexsheet.launch.commands import options
+from flexsheet.launch.commands.calibrate import (
+    app,
+    command_line,
+    load_true_devices,
+    make_provenance,
+    require_twin,
 )
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
-    print_fields,
-    print_json,
-    words,
+    print_result,
+    progress_bar,
 )
 
 if TYPE_CHECKING:
@@ -33,22 +28,20 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.sheet_calibration import SheetCalibration
 
-
-def register(app: typer.Typer) -> None:
-    """Add the command `sheet` to `flexsheet calibrate`."""
-    app.command(
-        "sheet",
-        epilog=examples(
-            "flexsheet calibrate sheet --rows pushes.csv --scene lab.yaml -o sheet.yaml",
-            "flexsheet calibrate sheet --bag pushes.mcap -o sheet.yaml",
-            "flexsheet calibrate sheet --twin launch/scenes/cylinder.yaml -o sheet.yaml",
-        ),
-    )(sheet)
+GAUGE_N = 0.005
+"""The standard deviation of the noise of the simulated force gauge, in newtons."""
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate sheet --rows pushes.csv --scene lab.yaml -o sheet.yaml",
+        "flexsheet calibrate sheet --bag pushes.mcap -o sheet.yaml",
+        "flexsheet calibrate sheet --twin launch/scenes/cylinder.yaml -o sheet.yaml",
+    ),
+)
 def sheet(
     *,
-    output: Annotated[Path, output_file("Sheet calibration file to write.")],
+    output: Annotated[Path, options.result_file("Sheet calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -65,7 +58,7 @@ def sheet(
             "finger rests at several depths; its scene replaces --scene.",
         ),
     ] = None,
-    scene_file: SceneOption = CYLINDER,
+    scene_file: options.SceneOption = options.CYLINDER,
     twin: Annotated[
         Path | None,
         typer.Option(
@@ -91,13 +84,9 @@ def sheet(
             "ratios above 1.15.",
         ),
     ] = False,
-    noise_n: Annotated[
-        float,
-        typer.Option(help="With --twin: standard deviation of the force noise, N.", min=0.0),
-    ] = 0.005,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Fit the force model of a sheet to the forces on a finger that pushes the sheet.
 
@@ -105,40 +94,35 @@ def sheet(
     cubic term of the force. The pushes are rows of a CSV file (--rows, --scene), come from a
     recording with a force gauge (--bag), or are simulated (--twin).
     """
+    from flexsheet.launch.calibration.sheet_bag import read_pushes
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
     from flexsheet.launch.calibration.sheet_rows import read_rows
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
-    check_folder("-o", output)
     if sum(one is not None for one in (rows, bag, twin)) != 1:
         raise CommandError(
             "give exactly one source of pushes: --rows CSV, --bag BAG or --twin SCENE"
         )
     require_twin(apparatus, simulated=twin is not None)
-    command = ["flexsheet", "calibrate", "sheet"]
     if rows is not None:
         scene = load_scene(scene_file)
         pushes, lines = read_rows(rows, scene.sheet, scene.finger.radius_m)
-        command += ["--rows", str(rows), "--scene", str(scene_file)]
         source = str(rows)
     elif bag is not None:
-        scene, pushes = _read_bag(bag)
+        try:
+            scene, pushes = read_pushes(bag)
+        except SheetModelFitError as error:
+            raise CommandError(f"{bag}: {error}") from error
         lines = list(range(1, len(pushes) + 1))
-        command += ["--bag", str(bag)]
         source = str(bag)
     else:
         assert twin is not None
         scene = load_scene(twin)
         true = load_true_devices(apparatus, scene)
-        pushes = simulate_pushes(scene, true, places=places, noise_n=noise_n, seed=seed)
+        pushes = simulate_pushes(scene, true, places=places, seed=seed)
         lines = list(range(1, len(pushes) + 1))
-        command += ["--twin", str(twin), "--noise-n", f"{noise_n:g}", "--seed", str(seed)]
-        command += [] if apparatus is None else ["--apparatus", apparatus]
-        command += ["--places"] if places else []
         source = f"twin of {scene.name}"
-    command += ["--table"] if table else []
-    command += ["--mooney"] if mooney else []
     try:
         calibration = make_calibration(
             scene,
@@ -151,7 +135,7 @@ def sheet(
         )
     except SheetModelFitError as error:
         raise CommandError(f"{source}: {error}") from error
-    save_sheet_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
+    save_sheet_calibration(calibration, output, comment=command_line())
     _print_result(calibration, output, as_json)
 
 
@@ -171,7 +155,6 @@ def make_calibration(
     SheetModelFitError if the pushes do not determine the parameters.
     """
     from functools import partial
-    from importlib.metadata import version
 
     from flexsheet.launch.calibration.sheet_fit import (
         estimate_hysteresis,
@@ -216,8 +199,7 @@ def make_calibration(
         )
     stretches = [push.edge_distance_m / scene.sheet.width_m for push in pushes]
     return SheetCalibration(
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        code_version=version("flexsheet"),
+        **make_provenance(),
         source=source,
         nominal_width_m=scene.sheet.width_m,
         height_m=scene.sheet.height_m,
@@ -248,90 +230,33 @@ def make_calibration(
     )
 
 
-def _read_bag(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
-    from flexsheet.launch.calibration.sheet_bag import read_pushes
-    from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
-
-    try:
-        return read_pushes(bag)
-    except SheetModelFitError as error:
-        raise CommandError(f"{bag}: {error}") from error
-
-
 def simulate_pushes(
-    scene: Scene, apparatus: Apparatus | None, *, places: bool, noise_n: float, seed: int
+    scene: Scene, apparatus: Apparatus | None, *, places: bool, seed: int
 ) -> list[MeasuredPush]:
-    """Simulate measured pushes on the sheet of a scene, and show a progress bar.
+    """Simulate measured pushes on the sheet of a scene.
 
-    places: push the whole sheet instead of only its centre. noise_n: standard deviation of the
-    force noise, N.
+    places: push the whole sheet instead of only its centre.
     """
-    from rich.progress import Progress
-
     from flexsheet.launch.calibration.sheet_rows import simulate_rows
 
-    with Progress(console=words.console, transient=True) as bar:
-        task = bar.add_task("simulating pushes", total=None)
+    with progress_bar("simulating pushes") as progress:
         return simulate_rows(
-            scene,
-            places=places,
-            noise_n=noise_n,
-            seed=seed,
-            apparatus=apparatus,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            scene, places=places, noise_n=GAUGE_N, seed=seed, apparatus=apparatus, progress=progress
         )
 
 
 def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
-    mooney, hysteresis = calibration.mooney_ratio, calibration.hysteresis_ratio
-    fitted = {
-        "modulus_thickness_n_per_m": calibration.modulus_thickness_n_per_m,
-        "slack_width_m": calibration.slack_width_m,
-        "cubic_ratio": calibration.cubic_ratio,
-        **({} if mooney is None else {"mooney_ratio": mooney}),
-        **({} if hysteresis is None else {"hysteresis_ratio": hysteresis}),
+    names = {"modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio"}
+    fitted = calibration.model_dump(include=names | {"mooney_ratio", "hysteresis_ratio"})
+    excluded = {f"line {one.line}": one.residual_ratio for one in calibration.left_out}
+    result = {
+        "calibration": str(output),
+        "rows": calibration.rows,
+        "left_out": [one.model_dump() for one in calibration.left_out] if as_json else excluded,
+        "residual_rms_ratio": calibration.residual_rms_ratio,
+        "max_residual_ratio": calibration.max_residual_ratio,
+        "residual_rms_sigmas": calibration.residual_rms_sigmas,
+        "table": calibration.table is not None,
+        **{name: one for name, one in fitted.items() if one is not None},
     }
-    if as_json:
-        print_json(
-            {
-                "calibration": str(output),
-                "rows": calibration.rows,
-                "left_out": [one.model_dump() for one in calibration.left_out],
-                "residual_rms_ratio": calibration.residual_rms_ratio,
-                "max_residual_ratio": calibration.max_residual_ratio,
-                "residual_rms_sigmas": calibration.residual_rms_sigmas,
-                "table": calibration.table is not None,
-                **{name: one.model_dump() for name, one in fitted.items()},
-            }
-        )
-        return
-    units = {
-        "modulus_thickness_n_per_m": ("modulus x thickness", 1.0, "N/m"),
-        "slack_width_m": ("width without tension", 1e3, "mm"),
-        "cubic_ratio": ("cubic term relative to ideal rubber", 1.0, ""),
-        "mooney_ratio": ("Mooney weight", 1.0, ""),
-        "hysteresis_ratio": ("energy lost in a cycle", 100.0, "%"),
-    }
-    print_fields(
-        [
-            ("calibration", output),
-            ("rows used", f"{calibration.rows - len(calibration.left_out)} of {calibration.rows}"),
-            *(
-                (
-                    units[name][0],
-                    f"{units[name][1] * one.value:.4g} "
-                    f"± {units[name][1] * one.standard_deviation:.2g} {units[name][2]}".rstrip(),
-                )
-                for name, one in fitted.items()
-            ),
-            (
-                "residuals",
-                f"{100 * calibration.residual_rms_ratio:.1f} % rms, "
-                f"{100 * calibration.max_residual_ratio:.1f} % max, "
-                f"{calibration.residual_rms_sigmas:.2f} standard deviations",
-            ),
-            ("table", "none" if calibration.table is None else calibration.table.ratios.shape),
-        ]
-    )
-    for one in calibration.left_out:
-        words.print(f"line {one.line} excluded: its residual is {100 * one.residual_ratio:+.0f} %")
+    print_result(result, as_json=as_json)

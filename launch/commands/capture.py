@@ -26,17 +26,14 @@ if TYPE_CHECKING:
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 POSES_PER_PAIR = 3
-"""The number of simulated board poses per requested image pair.
-
-It is greater than one because some poses are rejected.
-"""
+"""The number of simulated board poses per requested image pair; some poses are rejected."""
 
 
 def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
     """Yield grey image pairs of a real camera.
 
     source: YAML text, as in the parameter `source` of a camera node. Raises CommandError if the
-    source is invalid or the device fails.
+    source is invalid, and DeviceError if the device fails.
     """
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
@@ -64,17 +61,14 @@ def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
 
 def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
     from flexsheet.nodes.camera.devices import open_reader
-    from flexsheet.nodes.camera.image_pair import DeviceError, check_size
+    from flexsheet.nodes.camera.image_pair import check_size
 
-    try:
-        with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
-            for warning in reader.warnings:
-                words.print(f"camera: {warning}")
-            while (images := reader.read()) is not None:
-                check_size(images, scene.camera, source)
-                yield images.left, images.right
-    except DeviceError as error:
-        raise CommandError(str(error), FAILED) from error
+    with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
+        for warning in reader.warnings:
+            words.print(f"camera: {warning}")
+        while (images := reader.read()) is not None:
+            check_size(images, scene.camera, source)
+            yield images.left, images.right
 
 
 def simulate_views(
@@ -82,8 +76,7 @@ def simulate_views(
 ) -> Iterator[Views]:
     """Yield simulated image pairs of a calibration board, one pair for each random pose.
 
-    The images are those of the scene's camera. If an apparatus is given, they include its errors.
-    Raises CommandError if the board cannot be rendered.
+    If an apparatus is given, the images have the errors of its camera.
     """
     from flexsheet.nodes.twin.board import TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
@@ -96,10 +89,10 @@ def simulate_views(
 
 
 def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
-    """Write the image pairs that `capture` accepts to a new folder: left01.png, right01.png, ...
+    """Write the accepted image pairs to a new folder: left01.png, right01.png, ...
 
-    The function stops when the accepted board poses meet all requirements, when `views` ends, or at
-    Ctrl-C. It prints the requirements that are not met. Returns the number of pairs, at least one.
+    The function stops when the board poses meet all requirements, when `views` ends, or at Ctrl-C.
+    It prints the requirements that are not met. Returns the number of pairs, at least one.
     """
     if folder.exists():
         raise CommandError(f"--pictures {folder}: the folder exists; name a new folder")
@@ -134,7 +127,7 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
 
 @contextmanager
 def _show_coverage(capture: Capture) -> Iterator[Any]:
-    """Show the coverage of board poses in the terminal; yield its update function (hint, accepted).
+    """Show the coverage of board poses, and yield its update function (hint, accepted).
 
     If stderr is not a terminal, one line is printed for each accepted pair.
     """

@@ -18,6 +18,7 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_table,
     progress_words,
+    shown,
     words,
 )
 from flexsheet.launch.methods.results import replace_non_finite
@@ -70,8 +71,6 @@ def chart(
     blocks: Annotated[
         int,
         typer.Option(
-            "--blocks",
-            metavar="N",
             min=1,
             max=1000,
             help="For system: number of repetitions; each runs every configuration once.",
@@ -90,8 +89,6 @@ def chart(
     apparatuses: Annotated[
         int,
         typer.Option(
-            "--apparatuses",
-            metavar="N",
             min=0,
             max=100,
             help="For system: number of random samples of inaccurate hardware (apparatuses) for "
@@ -118,17 +115,18 @@ def chart(
     logs_on_stderr()
     chosen = [find_file(one, SCENES) for one in scene_files or ()]
     if family == SYSTEM:
-        from flexsheet.launch.commands.chart_system import measure_system
+        from flexsheet.launch.methods.system_chart import run_system_chart
 
-        measure_system(
-            chosen,
+        measure = partial(
+            run_system_chart,
+            chosen or sorted(SCENES.glob("*.yaml")),
             output,
             blocks=blocks,
             seconds=seconds,
             apparatuses=apparatuses,
             configurations=configurations or (),
-            as_json=as_json,
         )
+        _measure_system(measure, output / "system.svg", as_json=as_json)
         return
     from flexsheet.launch.methods import charts
     from flexsheet.launch.methods.results import describe_load
@@ -172,6 +170,67 @@ def _report(progress: Callable[[str], None], family: str, text: str) -> None:
     progress(f"{family}: {text}")
 
 
+def _measure_system(measure: Callable[..., dict[str, Any]], image: Path, *, as_json: bool) -> None:
+    """Measure graph configurations, and write the results and a chart.
+
+    measure: function that measures and reports its progress to a given function.
+    """
+    import json
+
+    from flexsheet.launch.methods.results import describe_load
+    from flexsheet.launch.methods.system_picture import draw_system_chart
+    from flexsheet.messages.files import write_file
+
+    if busy := describe_load():
+        words.print(busy, style="yellow")
+    with progress_words() as progress:
+        result = measure(progress=progress)
+    draw_system_chart(result, image)
+    result = replace_non_finite({**result, "picture": str(image)})
+    write_file(image.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+    if as_json:
+        print_json(result)
+        return
+    _print_configurations(result)
+    for one in result["failed"]:
+        words.print(f"{one['scene']}: {one['trial']} failed: {one['error']}")
+    words.print(f"chart: {image}")
+
+
+def _print_configurations(result: dict[str, Any]) -> None:
+    from flexsheet.launch.methods.system_chart import ERRORS
+
+    front = {(one["scene"], one["configuration"]) for one in result["front"]}
+    columns = ("scene", "configuration", "cores", "to arm, ms", "to image, ms", *ERRORS)
+    rows = [
+        (
+            point["scene"],
+            point["configuration"],
+            f"{point['cpu_cores']:.2f}",
+            _latency(point["exposure_to_arm_ms"]),
+            _latency(point["exposure_to_light_ms"]),
+            *(_error(point, key) for key in ERRORS),
+            "front" if (point["scene"], point["configuration"]) in front else "",
+            "" if point["meets_tolerances"] else "fails: " + ", ".join(point["failing"]),
+        )
+        for point in result["points"]
+    ]
+    print_table((*columns, "", ""), rows)
+
+
+def _latency(found: dict[str, float] | None) -> str:
+    return "-" if found is None else f"{found['p50']:.1f} / {found['p99']:.1f}"
+
+
+def _error(point: dict[str, Any], key: str) -> str:
+    spread = point["spread"].get(f"{key}.p95")
+    if spread is None:
+        return "-"
+    if spread["low"] is None:
+        return f"{spread['value']:.3g}"
+    return f"{spread['value']:.3g} ({spread['low']:.3g}-{spread['high']:.3g})"
+
+
 def _print_methods(result: dict[str, Any]) -> None:
     from flexsheet.launch.methods.charts import format_duration, summarize_methods
 
@@ -180,7 +239,7 @@ def _print_methods(result: dict[str, Any]) -> None:
             one["method"],
             format_duration(one["median_s"]),
             format_duration(one["p99_s"]),
-            *("-" if one[key] is None else f"{one[key]:.3g}" for key in ("error", "error_outside")),
+            *(shown(one[key]) for key in ("error", "error_outside")),
             f"{one['inside']} of {one['cases']}",
             "front" if one["front"] else "",
         )
@@ -200,7 +259,7 @@ def _print_points(result: dict[str, Any]) -> None:
             ", ".join(f"{key} {_short(value)}" for key, value in point["params"].items()),
             f"{point['median_s'] * 1e6:.1f}",
             f"{point['p99_s'] * 1e6:.1f}",
-            "-" if point["error"] is None else f"{point['error']:.4g}",
+            shown(point["error"], ".4g"),
             *(_short(point["extra_metrics"].get(name)) for name in extra_names),
             "yes" if point["in_range"] else "no",
             "front" if point["method"] in result["front"] else "",

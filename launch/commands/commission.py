@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    SeedOption,
-)
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -50,30 +42,23 @@ def commission(
             help="Folder for state and results; if it exists, the commissioning continues.",
         ),
     ],
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    apparatus: ApparatusOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    apparatus: options.ApparatusOption = None,
     data: Annotated[
         list[str] | None,
         typer.Option(
-            "--data",
             metavar="STEP=PATH",
             help="Captured data of a step; repeat the option for several steps.",
         ),
     ] = None,
     finger_radius_mm: Annotated[
         float | None,
-        typer.Option(
-            "--finger-radius-mm",
-            metavar="MM",
-            min=1.0,
-            help="Measured radius of the fingertip, mm.",
-        ),
+        typer.Option(metavar="MM", min=1.0, help="Measured radius of the fingertip, mm."),
     ] = None,
     sheet_kg_per_m2: Annotated[
         float | None,
         typer.Option(
-            "--sheet-kg-per-m2",
             metavar="DENSITY",
             min=0.0,
             help="Measured mass per area of the sheet, kg/m²; it determines the sag.",
@@ -128,14 +113,13 @@ def commission(
     duration: Annotated[
         float,
         typer.Option(
-            "--duration",
             metavar="SECONDS",
             min=2.0,
             help="Duration of the finger's stroke in the verification, s.",
         ),
     ] = 10.0,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all devices of a laboratory in sequence, and verify the result.
 
@@ -145,7 +129,7 @@ def commission(
     them and stops with exit code 1.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName
-    from flexsheet.launch.commands.calibrate import FOUR_BITS, _parse_board
+    from flexsheet.launch.commands.calibrate import FOUR_BITS, parse_board
     from flexsheet.launch.commands.commission_steps import open_laboratory
 
     given = {name: Path(path) for name, path in _parse_pairs("--data", data).items()}
@@ -155,13 +139,11 @@ def commission(
     if apparatus is not None and (given or any(one is not None for one in measured)):
         raise CommandError(
             "--data, --finger-radius-mm and --sheet-kg-per-m2 are for real devices; remove them or "
-            "--apparatus",
-            BAD_INPUT,
+            "--apparatus"
         )
     if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
         raise CommandError(
-            "--check repeats only the verification; remove --step, --skip and other --data",
-            BAD_INPUT,
+            "--check repeats only the verification; remove --step, --skip and other --data"
         )
     lab, devices = open_laboratory(
         output,
@@ -171,8 +153,8 @@ def commission(
         data=given,
         finger_radius_m=None if finger_radius_mm is None else 1e-3 * finger_radius_mm,
         sheet_kg_per_m2=sheet_kg_per_m2,
-        board=_parse_board(board, square_mm, None, FOUR_BITS),
-        flange_board=_parse_board(flange_board, flange_square_mm, None, FOUR_BITS),
+        board=parse_board(board, square_mm, None, FOUR_BITS),
+        flange_board=parse_board(flange_board, flange_square_mm, None, FOUR_BITS),
         seconds=duration,
         seed=seed,
     )
@@ -181,8 +163,7 @@ def commission(
         if unfinished:
             raise CommandError(
                 f"--check: the steps {', '.join(unfinished)} are not done; run them first, or skip "
-                "them with a reason",
-                BAD_INPUT,
+                "them with a reason"
             )
         repeats = [StepName.VERIFICATION]
     missing: MissingDataError | None = None
@@ -204,12 +185,12 @@ def _parse_step(option: str, text: str) -> StepName:
     from flexsheet.launch.calibration.commission import STEPS, StepName
 
     if text not in STEPS:
-        raise CommandError(f"{option} {text}: expected one of {', '.join(STEPS)}", BAD_INPUT)
+        raise CommandError(f"{option} {text}: expected one of {', '.join(STEPS)}")
     return StepName(text)
 
 
 def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
-    """Parse the values STEP=TEXT of a command-line option; return the texts by step.
+    """Return the texts by step from the values STEP=TEXT of a command-line option.
 
     Raises CommandError for an unknown step or an empty text.
     """
@@ -217,9 +198,7 @@ def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
     for one in given or ():
         name, _, text = one.partition("=")
         if not text.strip():
-            raise CommandError(
-                f"{option} {one}: expected STEP=TEXT with a non-empty text", BAD_INPUT
-            )
+            raise CommandError(f"{option} {one}: expected STEP=TEXT with a non-empty text")
         pairs[_parse_step(option, name)] = text.strip()
     return pairs
 
@@ -230,22 +209,15 @@ def summarize(lab: Commissioning) -> dict[str, Any]:
 
     steps = []
     for record in (lab.state.steps[name] for name in StepName if name in lab.state.steps):
-        result = record.result
-        steps.append(
-            {
-                "name": record.name,
-                "seconds": record.seconds,
-                "cpu_seconds": record.cpu_seconds,
-                "residual": None if result is None else result.residual,
-                "unit": None if result is None else result.unit,
-                "limit": None if result is None else result.limit,
-                "within_limit": None if result is None else result.within_limit,
-                "uncertainty": {} if result is None else result.uncertainty,
-                "missing": [] if result is None else [one.model_dump() for one in result.missing],
-                "advice": None if result is None or result.within_limit else result.advice,
-                "skipped_because": record.skipped_because,
-            }
-        )
+        row = dict.fromkeys(("residual", "unit", "limit", "within_limit", "advice"))
+        row |= {"uncertainty": {}, "missing": []}
+        if (result := record.result) is not None:
+            shown = {"residual", "unit", "limit", "uncertainty", "missing"}
+            row = result.model_dump(mode="json", include=shown)
+            row["within_limit"] = result.within_limit
+            row["advice"] = None if result.within_limit else result.advice
+        shown = {"name", "seconds", "cpu_seconds", "skipped_because"}
+        steps.append({**record.model_dump(mode="json", include=shown), **row})
     verified = lab.state.steps.get(StepName.VERIFICATION)
     found = None if verified is None or verified.result is None else verified.result.figures
     apparatus = lab.folder / APPARATUS_FILE
@@ -283,9 +255,9 @@ def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
             for one in result["steps"]
         ],
     )
-    words.print(f"launch file: {result['launch_file']}\nreport: {result['report']}", markup=False)
+    words.print(f"launch file: {result['launch_file']}\nreport: {result['report']}")
     if missing is not None:
-        words.print(str(missing), markup=False)
+        words.print(str(missing))
     if verdict := format_verdict(lab.state):
         limits = [f"What limits the accuracy: {one}" for one in list_limits(lab.state)[:1]]
-        words.print("\n".join([*verdict, *limits]), markup=False)
+        words.print("\n".join([*verdict, *limits]))

@@ -1,8 +1,7 @@
 """Run the steps of `flexsheet commission`, with simulated devices or with captured data.
 
-The steps use the functions of the commands `flexsheet calibrate`. With simulated devices, the steps
-use only the measurements of these devices: images, joint angles, the forces of a gauge, and the
-finger's radius. The steps do not read the true parameters (apparatus).
+Simulated devices are calibrated only from simulated measurements: images, joint angles, the forces
+of a gauge, and the finger's radius. The fits do not read the true parameters (apparatus).
 """
 
 from __future__ import annotations
@@ -35,6 +34,7 @@ from flexsheet.launch.calibration.commission import (
 from flexsheet.launch.commands import (
     calibrate,
     calibrate_arms,
+    calibrate_edges,
     calibrate_marker,
     calibrate_projector,
     calibrate_sheet,
@@ -43,10 +43,14 @@ from flexsheet.launch.commands import (
 from flexsheet.launch.plans.apparatus import format_apparatus
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus
-from flexsheet.messages.calibration import Board, load_calibration, save_calibration
+from flexsheet.messages.calibration import (
+    Board,
+    StereoCalibration,
+    load_calibration,
+    save_calibration,
+)
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene, require_projector
-from flexsheet.nodes.models.rigid import pose_matrix, rpy_from_rotation
 from flexsheet.nodes.models.sheet.tension import edge_force_n
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -63,13 +67,10 @@ FLANGE_BOARD = Board(kind="chessboard", columns=7, rows=5, square_m=0.015)
 CALLIPER_M = 3e-4
 """The standard deviation of the simulated measurement of the finger's radius, in metres."""
 
-GAUGE_N = 0.005
-"""The standard deviation of the noise of the simulated force gauge, in newtons."""
-
 WEIGHING_RATIO = 0.004
 """The relative standard deviation of the measured mass per area of a simulated sheet.
 
-It is caused by the errors of the scale (0.2 g) and of the ruler (0.5 mm).
+The causes are the errors of the scale (0.2 g) and of the ruler (0.5 mm).
 """
 
 INSTRUCTIONS: dict[StepName, str] = {
@@ -135,8 +136,8 @@ class Laboratory:
     apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
     devices. data: file or folder with the captured data, by step. finger_radius_m: measured radius
     of the fingertip, for real devices. sheet_kg_per_m2: measured mass per area of a real sheet.
-    seconds: duration of the verification. simulated_time: verify simulated devices without a
-    running graph. pairs, arm_poses, sheet_poses: numbers of simulated observations.
+    seconds: duration of the stroke in the verification. simulated_time: verify simulated devices
+    without a running graph. pairs, arm_poses, sheet_poses: numbers of simulated observations.
     """
 
     apparatus: Apparatus | None
@@ -177,13 +178,17 @@ class Laboratory:
 
     @contextmanager
     def _folder(self, step: StepName) -> Iterator[Path]:
-        """Yield the folder with the captured data of a step, or a temporary folder for simulated
-        data."""
+        """Yield the folder with the captured data, or a temporary folder for simulated data."""
         if self.apparatus is None:
             yield self._find_data(step)
             return
         with tempfile.TemporaryDirectory(prefix="flexsheet-commission-") as folder:
             yield Path(folder)
+
+    def _load(self, lab: Commissioning) -> tuple[Scene, StereoCalibration | None]:
+        """Load the scene, and the stereo calibration if the step camera is finished."""
+        stereo = lab.find_file(STEREO)
+        return load_scene(lab.scene_copy), None if stereo is None else load_calibration(stereo)
 
     def calibrate_camera(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.capture import Capture
@@ -213,7 +218,7 @@ class Laboratory:
                 *(_find_images(folder, side) for side in ("left", "right")),
                 board=self.board,
                 device=camera.device,
-                working_distance_m=float(np.linalg.norm(camera.world_from_left.position_m)),
+                working_distance_m=calibrate.measure_distance_m(scene),
             ).calibration
         save_calibration(found, lab.folder / STEREO)
         assert found.uncertainty is not None
@@ -233,9 +238,7 @@ class Laboratory:
     def calibrate_arms(self, lab: Commissioning) -> StepResult:
         from flexsheet.messages.arms_calibration import save_arms_calibration
 
-        scene = load_scene(lab.scene_copy)
-        stereo = lab.find_file(STEREO)
-        optics = None if stereo is None else load_calibration(stereo)
+        scene, optics = self._load(lab)
         fits = {}
         with self._folder(StepName.ARMS) as folder:
             for side in calibrate_arms.SIDES:
@@ -250,10 +253,8 @@ class Laboratory:
                 )
         measured = calibrate_arms.make_calibration(fits, scene, self.flange_board)
         save_arms_calibration(measured, lab.folder / ARMS)
-        values: dict[str, Any] = {}
         uncertainty = {}
         for side, fit in fits.items():
-            values |= _pose_values(f"arms.{side}.world_from_base", fit.world_from_base)
             std_m, std_rad = fit.compute_std(np.zeros(3))
             uncertainty[f"{side}_position_mm"] = 1e3 * std_m
             uncertainty[f"{side}_rotation_mrad"] = 1e3 * std_rad
@@ -263,7 +264,7 @@ class Laboratory:
             limit=1.0,
             advice="Check that the board is rigid on the flange and that the arm was at rest.",
             uncertainty=uncertainty,
-            scene_values=values,
+            scene_values=calibrate_arms.list_scene_values(measured),
         )
 
     def calibrate_sheet(self, lab: Commissioning) -> StepResult:
@@ -278,7 +279,7 @@ class Laboratory:
             source, mass_kg_per_m2 = str(file), self.sheet_kg_per_m2
         else:
             pushes = calibrate_sheet.simulate_pushes(
-                scene, self.apparatus, places=False, noise_n=GAUGE_N, seed=self.seed
+                scene, self.apparatus, places=False, seed=self.seed
             )
             lines, source = list(range(1, len(pushes) + 1)), f"twin of {scene.name}"
             true = apply_apparatus(scene, self.apparatus).sheet
@@ -350,13 +351,6 @@ class Laboratory:
             fit = fit_projector(points, guess)
         except ProjectorError as error:
             raise CommissionError(f"step projector: {error}") from error
-        lens = fit.projector.lens
-        pose = fit.projector.world_from_projector
-        matrix = pose_matrix(pose)
-        values = _pose_values("projector.world_from_projector", matrix)
-        for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
-            values[f"projector.lens.{key}"] = calibrate.round_digits(getattr(lens, key))
-        values["projector.lens.distortion"] = [calibrate.round_digits(k) for k in lens.distortion]
         return StepResult(
             residual=fit.rms_px,
             unit="px",
@@ -366,7 +360,7 @@ class Laboratory:
                 "held_out_px": fit.held_out_rms_px,
                 "on_sheet_mm": 1e3 * fit.held_out_rms_px * fit.rms_m / max(fit.rms_px, 1e-9),
             },
-            scene_values=values,
+            scene_values=calibrate_projector.list_scene_values(fit.projector),
             covariances={"shift_px2": fit.shift_covariance_px2.tolist()},
         )
 
@@ -374,27 +368,17 @@ class Laboratory:
         from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
         from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
 
-        scene = load_scene(lab.scene_copy)
-        stereo = lab.find_file(STEREO)
+        scene, optics = self._load(lab)
         if self.apparatus is None:
             poses = read_edge_marks(self._find_data(StepName.EDGES))
         else:
-            optics = None if stereo is None else load_calibration(stereo)
             poses = simulate_edge_marks(scene, self.apparatus, calibration=optics, seed=self.seed)
         try:
             fits = fit_edges(poses, scene)
         except EdgeFitError as error:
             raise CommissionError(f"step edges: {error}; {error.remedy}") from error
-        values: dict[str, Any] = {}
         uncertainty = {}
         for side, fit in fits.items():
-            arm, key = fit.arm, f"arms.{side}"
-            values |= _pose_values(f"{key}.world_from_base", pose_matrix(arm.world_from_base))
-            values |= _pose_values(f"{key}.flange_from_edge", pose_matrix(arm.flange_from_edge))
-            offsets = [calibrate.round_digits(one) for one in arm.joint_offsets_rad]
-            values[f"{key}.joint_offsets_rad"] = offsets
-            compliance = calibrate.round_digits(arm.flange_compliance_m_per_n)
-            values[f"{key}.flange_compliance_m_per_n"] = compliance
             uncertainty[f"{side}_edge_mm"] = 1e3 * fit.edge_std_m
             uncertainty[f"{side}_compliance_um_per_n"] = 1e6 * fit.compliance_std_m_per_n
         return StepResult(
@@ -404,16 +388,14 @@ class Laboratory:
             limit=0.4,
             advice="Check the marks and their fixing; repeat the step arms.",
             uncertainty=uncertainty,
-            scene_values=values,
+            scene_values=calibrate_edges.list_scene_values(fits),
         )
 
     def calibrate_marker(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.touches import read_touches, simulate_touches
         from flexsheet.messages.marker_calibration import save_marker_calibration
 
-        scene = load_scene(lab.scene_copy)
-        stereo = lab.find_file(STEREO)
-        optics = None if stereo is None else load_calibration(stereo)
+        scene, optics = self._load(lab)
         radius_m = self.finger_radius_m
         if self.apparatus is None:
             file = self._find_data(StepName.MARKER)
@@ -444,12 +426,10 @@ class Laboratory:
     def calibrate_eyes(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.eyes import fit_eyes, read_alignments, simulate_alignments
 
-        scene = load_scene(lab.scene_copy)
-        stereo = lab.find_file(STEREO)
+        scene, optics = self._load(lab)
         if self.apparatus is None:
             alignments = read_alignments(self._find_data(StepName.EYES))
         else:
-            optics = None if stereo is None else load_calibration(stereo)
             alignments = simulate_alignments(
                 scene, self.apparatus, calibration=optics, seed=self.seed
             )
@@ -466,9 +446,7 @@ class Laboratory:
             unit="mrad",
             limit=6.0,
             advice="Use a chin rest, and align again with the bead at other positions.",
-            uncertainty={
-                "image_mm": float(shift_mm / (behind_m + distance_m)),
-            },
+            uncertainty={"image_mm": float(shift_mm / (behind_m + distance_m))},
             figures={
                 "eyes_lateral_std_mm": lateral_mm,
                 "eyes_depth_std_mm": depth_mm,
@@ -486,8 +464,7 @@ class Laboratory:
         from flexsheet.launch.calibration.display_latency import DisplayLatencyError
         from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
-        scene, stereo = load_scene(lab.scene_copy), lab.find_file(STEREO)
-        optics = None if stereo is None else load_calibration(stereo)
+        scene, optics = self._load(lab)
         graph, added_s = load_graph(lab.launch_copy), 0.0
         if self.apparatus is None:
             added_s = NodeCalibrations.of(graph).stamp_offset_s
@@ -537,8 +514,7 @@ class Laboratory:
     def _measure_display_latency(
         self, scene: Scene, graph: ResolvedGraph, stamp: MeasuredLag | None, added_s: float
     ) -> MeasuredLag:
-        """Measure the display latency: the time from the swap of a frame to the middle of its
-        display.
+        """Measure the time from the swap of a frame to the middle of its display.
 
         stamp: measured offset of the camera's timestamps; None if it is unknown. added_s:
         correction of this offset that the timestamps in the data already contain, s.
@@ -569,10 +545,7 @@ class Laboratory:
         )
 
     def verify(self, lab: Commissioning) -> StepResult:
-        """Measure the errors of the calibrated system during a stroke.
-
-        For simulated devices, the errors at rest are also measured.
-        """
+        """Measure the errors during a stroke and, for simulated devices, the errors at rest."""
         from flexsheet.launch.bags.report.findings import BRIEFLY_BUSY_FRACTION
         from flexsheet.launch.calibration.prediction import predict_errors
 
@@ -603,8 +576,7 @@ class Laboratory:
 
 
 def collect_knowledge(lab: Commissioning) -> Knowledge:
-    """Collect the calibrations and covariances of the finished steps for the prediction of
-    errors."""
+    """Collect the calibrations and covariances from which errors are predicted."""
     from flexsheet.launch.calibration.prediction import (
         EYE_STD_M,
         SHEET_MASS_STD_RATIO,
@@ -636,12 +608,10 @@ def collect_knowledge(lab: Commissioning) -> Knowledge:
 def run_verification(
     lab: Commissioning, seconds: float, seed: int, *, simulated_time: bool
 ) -> dict[str, Any]:
-    """Run a stroke in a simulated laboratory, and return the true errors of the display.
+    """Measure the true errors of a simulated laboratory in a stroke, at rest and in motion.
 
-    The result contains errors of the stroke, errors at rest, and errors of fingertip and sheet at
-    the working speed. seconds: duration of the stroke. simulated_time: run the stroke without a
-    graph, and omit the self-checks and the errors before calibration. Raises VerificationError if
-    the stroke fails.
+    seconds: duration of the stroke. simulated_time: run the stroke without a graph, and omit the
+    self-checks and the errors before calibration. Raises VerificationError if the stroke fails.
     """
     from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
     from flexsheet.launch.experiments.maps import draw_cross_errors
@@ -709,19 +679,6 @@ def _find_images(folder: Path, side: str) -> list[Path]:
     return found
 
 
-def _pose_values(key: str, matrix: Any) -> dict[str, Any]:
-    """Return position and angles of a pose (4, 4), by their dotted paths in a scene file.
-
-    key: dotted path of the pose.
-    """
-    return {
-        f"{key}.position_m": [calibrate.round_digits(one) for one in matrix[:3, 3]],
-        f"{key}.rpy_rad": [
-            calibrate.round_digits(one) for one in rpy_from_rotation(matrix[:3, :3])
-        ],
-    }
-
-
 def _read_stroke(path: Path) -> dict[str, Any]:
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -742,11 +699,11 @@ def describe_sheet(
 ) -> dict[str, float]:
     """Return the scene values of a measured sheet, by their dotted paths.
 
+    The flange compliances are scaled by the ratio of the tensions of the scene's sheet and the
+    measured sheet. The tension then displaces the flanges as far as the step `edges` measured.
+
     modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
-    tension. mass_kg_per_m2: mass per area, from which the density is computed; None omits the
-    density. The flange compliances are scaled by the ratio of the tensions of the scene's sheet and
-    the measured sheet. Therefore the tension displaces the flanges as far as the step `edges`
-    measured.
+    tension. mass_kg_per_m2: mass per area, from which the density is computed; None omits it.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m

@@ -1,36 +1,38 @@
 """Complete names on the command line in the user's shell.
 
-If no name matches, the shell completes file names. Modules are imported only when they are needed,
-because each completion is a separate process.
+Modules are imported only when they are needed, because each completion is a separate process.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file, list_shipped
 
-
-def topics(incomplete: str) -> list[str]:
-    """Return the topic names that start with `incomplete`."""
-    from flexsheet.messages.topics import TOPICS
-
-    return _filter(TOPICS, incomplete)
+if TYPE_CHECKING:
+    from flexsheet.launch.plans.plan_model import ResolvedNode
 
 
-def node_types(incomplete: str) -> list[str]:
-    """Return the node types that start with `incomplete`."""
-    from flexsheet.nodes import NODES
+def _keys_of(module: str, name: str) -> Callable[[str], list[str]]:
+    """Return a function that completes the keys of a table, which is a variable of a module."""
 
-    return _filter(NODES, incomplete)
+    def complete(incomplete: str) -> list[str]:
+        return _filter(getattr(import_module(module), name), incomplete)
+
+    return complete
+
+
+topics = _keys_of("flexsheet.messages.topics", "TOPICS")
+node_types = _keys_of("flexsheet.nodes", "NODES")
 
 
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the host names that start with `incomplete`, from the launch file on the command
-    line."""
+    """Return the matching host names of the launch file on the command line."""
     from flexsheet.launch.plans.documents import BadInputError
     from flexsheet.launch.plans.plan import load_graph
 
@@ -43,29 +45,28 @@ def hosts(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def tuned_families(incomplete: str) -> list[str]:
-    """Return the names of method families of `flexsheet tune` that start with `incomplete`."""
+    """Return the matching method families of `flexsheet tune`."""
     from flexsheet.launch.methods.tune import TUNABLES
 
     return _filter((one.name for one in TUNABLES), incomplete)
 
 
 def gestures(incomplete: str) -> list[str]:
-    """Return the gesture names that start with `incomplete`, or paths of CSV files if none
-    matches."""
+    """Return the matching gesture names, or paths of CSV files if no name matches."""
     from flexsheet.launch.experiments.gestures import GESTURES
 
     return _filter(GESTURES, incomplete) or files(".csv")(incomplete)
 
 
 def runs(incomplete: str) -> list[str]:
-    """Return the run directories of running graphs that start with `incomplete`."""
+    """Return the matching run directories of running graphs."""
     from flexsheet.launch.running.runs import list_live_runs
 
     return _filter((str(run.directory) for run in list_live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:
-    """Return the names of method families of `flexsheet chart` that start with `incomplete`."""
+    """Return the matching method families of `flexsheet chart`."""
     from flexsheet.launch.methods.charts import FAMILIES
 
     return _filter([*FAMILIES, "system"], incomplete)
@@ -94,40 +95,35 @@ yaml_files = files(".yaml", ".yml")
 
 
 def launch_files(incomplete: str) -> list[str]:
-    """Return the names of shipped launch files and the paths of YAML files that match
-    `incomplete`."""
+    """Return the matching names of shipped launch files and paths of YAML files."""
     return _filter(list_shipped(LAUNCH_FILES), incomplete) + yaml_files(incomplete)
 
 
 def scenes(incomplete: str) -> list[str]:
-    """Return the names of shipped scenes and the paths of YAML files that match `incomplete`."""
+    """Return the matching names of shipped scenes and paths of YAML files."""
     return _filter(list_shipped(SCENES), incomplete) + yaml_files(incomplete)
 
 
 def nodes(incomplete: str) -> list[str]:
-    """Return the names of running nodes and of node types that start with `incomplete`."""
-    from flexsheet.launch.commands.graph import NoGraphError, running_graph
-
-    try:
-        running = list(running_graph(None)[0].nodes)
-    except NoGraphError:
-        running = []
+    """Return the matching names of running nodes and of node types."""
+    running = [node.name for node in _running_nodes()]
     return list(dict.fromkeys([*_filter(running, incomplete), *node_types(incomplete)]))
 
 
 def node_parameters(incomplete: str) -> list[str]:
-    """Return the parameters of the running graph, as NODE.PARAMETER, that start with
-    `incomplete`."""
+    """Return the matching parameters of the running graph, as NODE.PARAMETER."""
+    found = (f"{node.name}.{name}" for node in _running_nodes() for name in node.parameters)
+    return _filter(found, incomplete)
+
+
+def _running_nodes() -> list[ResolvedNode]:
+    """Return the nodes of the running graph; return an empty list if no graph is running."""
     from flexsheet.launch.commands.graph import NoGraphError, running_graph
 
     try:
-        plan, _ = running_graph(None)
+        return list(running_graph(None)[0].nodes.values())
     except NoGraphError:
         return []
-    return _filter(
-        (f"{node.name}.{name}" for node in plan.nodes.values() for name in node.parameters),
-        incomplete,
-    )
 
 
 def _filter(names: Iterable[str], incomplete: str) -> list[str]:

@@ -6,26 +6,15 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
+from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.experiment import (
     make_result_folder,
     print_followed,
     print_strokes,
 )
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    ResultFolderOption,
-    SettingsOption,
-    make_app,
-    with_scene,
-)
 from flexsheet.launch.commands.output import examples, print_json, progress_words, words
 
-app = make_app()
+app = options.make_app()
 
 
 @app.command(
@@ -33,10 +22,10 @@ app = make_app()
 )
 def demo(
     *,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     finger_path: Annotated[
         str | None,
         typer.Option(
@@ -46,14 +35,14 @@ def demo(
             autocompletion=complete.gestures,
         ),
     ] = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate strokes, a tilted sheet and a pushed sheet, and draw charts of the errors."""
     from flexsheet.launch.experiments.demo import run_demo
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     path = None if finger_path is None else load_path(launch_file, finger_path, given)
     folder = make_result_folder(output, "demo")
     with progress_words() as progress:

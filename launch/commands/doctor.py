@@ -9,11 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import JsonOption, SceneArgument, output_file
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, result_file
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
-    check_folder,
     examples,
     print_fields,
     print_json,
@@ -85,7 +84,7 @@ def check_scene(
     scene_file: SceneArgument,
     output: Annotated[
         Path | None,
-        output_file("Image file (.png or .svg) to write with the reachable range.", "IMAGE"),
+        result_file("Image file (.png or .svg) to write with the reachable range.", "IMAGE"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -99,8 +98,6 @@ def check_scene(
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
 
-    if output is not None:
-        check_folder("--output", output)
     scene = load_scene(scene_file)
     with progress_words() as progress:
         layout = check_layout(scene, progress=progress)
@@ -122,8 +119,7 @@ def check_scene(
 
 
 def _describe_branch(branch: dict[str, Any]) -> str:
-    """Return a text that describes a joint solution, by its names or by its joint angles in
-    degrees."""
+    """Describe a joint solution by its names, or by its joint angles in degrees."""
     if "seed_rad" not in branch:
         return ", ".join(branch.values())
     degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])

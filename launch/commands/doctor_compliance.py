@@ -7,37 +7,30 @@ from typing import Annotated
 
 import typer
 
+from flexsheet.launch.commands.doctor import app
 from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
     FAILED,
     examples,
-    print_fields,
+    print_columns,
     print_json,
-    print_table,
+    print_result,
     progress_words,
+    words,
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `compliance` to `flexsheet doctor`."""
-    app.command(
-        "compliance",
-        epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
-    )(compliance)
-
-
+@app.command(
+    epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
+)
 def compliance(
     scene_file: SceneArgument,
     calibration: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Sheet calibration file from `flexsheet calibrate sheet`."
-        ),
+        Path | None, typer.Option(help="Sheet calibration file from `flexsheet calibrate sheet`.")
     ] = None,
     delay_ms: Annotated[
         float,
         typer.Option(
-            "--delay-ms",
             metavar="MS",
             min=0.0,
             max=500.0,
@@ -71,31 +64,22 @@ def compliance(
     if as_json:
         print_json(result)
     else:
-        print_table(
-            ("depth, mm", "object, N", "rendered, N", "error, %", "normal offset, mm"),
-            [
-                (
-                    f"{row['depth_mm']:.0f}",
-                    f"{row['target_n']:.3f}",
-                    f"{row['rendered_n']:.3f}",
-                    f"{100 * (row['rendered_n'] / max(row['target_n'], 1e-9) - 1):+.1f}",
-                    f"{row['normal_offset_mm']:.2f}",
-                )
-                for row in result["rows"]
-            ],
+        rows = [
+            {**row, "error": row["rendered_n"] / max(row["target_n"], 1e-9) - 1}
+            for row in result["rows"]
+        ]
+        print_columns(
+            rows,
+            {
+                "depth, mm": ("depth_mm", ".0f"),
+                "object, N": ("target_n", ".3f"),
+                "rendered, N": ("rendered_n", ".3f"),
+                "error": ("error", "+.1%"),
+                "normal offset, mm": ("normal_offset_mm", ".2f"),
+            },
         )
-        print_fields(
-            [
-                ("stretch", f"{result['stretch_ratio']:.3f}"),
-                ("maximum edge force", f"{result['max_edge_force_n']:.1f} N"),
-                ("sheet motion per finger depth", f"{result['advance_per_depth']:.2f}"),
-                (
-                    "bandwidth of the depth's filter",
-                    f"{result['filter_bandwidth_rad_per_s']:.1f} rad/s",
-                ),
-                ("maximum error", f"{100 * result['worst_error_ratio']:.1f} %"),
-                ("result", result["note"] or "the error is within the tolerance"),
-            ]
-        )
+        figures = {name: one for name, one in result.items() if name not in ("rows", "note")}
+        print_result(figures, as_json=False)
+        words.print(result["note"] or "the error is within the tolerance")
     if result["note"]:
         raise typer.Exit(FAILED)

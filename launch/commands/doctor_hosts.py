@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.doctor import app
 from flexsheet.launch.commands.graph import running_graph
-from flexsheet.launch.commands.options import JsonOption, find_launch_file
+from flexsheet.launch.commands.options import LAUNCH_FILE, JsonOption
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
@@ -29,26 +30,19 @@ if TYPE_CHECKING:
 TIMEOUT_S = 4.0
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `hosts` to `flexsheet doctor`."""
-    app.command(
-        "hosts",
-        epilog=examples(
-            "flexsheet doctor hosts",
-            "flexsheet doctor hosts launch/lab.yaml",
-            "flexsheet doctor hosts launch/lab.yaml --host left --json",
-        ),
-    )(hosts)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet doctor hosts",
+        "flexsheet doctor hosts launch/lab.yaml",
+        "flexsheet doctor hosts launch/lab.yaml --host left --json",
+    ),
+)
 def hosts(
     launch_file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="LAUNCH_FILE",
             help="Launch file; default: launch file of the graph running on this computer.",
-            autocompletion=complete.launch_files,
-            callback=find_launch_file,
+            **LAUNCH_FILE,
         ),
     ] = None,
     host: Annotated[
@@ -106,7 +100,7 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved launch file and its run on this computer, or None if it is not running.
+    """Return the resolved graph and its run on this computer, or None if it is not running.
 
     If `launch_file` is None, the newest running graph is used.
     """
@@ -126,7 +120,8 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
 def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
     """Return the name of this computer among the hosts of a graph.
 
-    requested: name given by the user, or None. Raises CommandError if the name is ambiguous.
+    requested: name given by the user, or None. Raises CommandError if the name is unknown, or if
+    the addresses of this computer do not determine it.
     """
     from flexsheet.launch.health.doctor_hosts import list_own_addresses
     from flexsheet.launch.plans.documents import did_you_mean

@@ -7,27 +7,16 @@ from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import running_graph
-from flexsheet.launch.commands.options import (
-    JsonOption,
-    OtherSceneOption,
-    RunOption,
-    SettingsOption,
-    find_launch_file,
-    make_app,
-    output_file,
-    with_scene,
-)
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_json,
     words,
 )
 
-app = make_app()
+app = options.make_app()
 
 
 @app.command(
@@ -42,19 +31,16 @@ def graph(
     launch_file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="LAUNCH_FILE",
-            help="Launch file; default: launch file of the running graph.",
-            autocompletion=complete.launch_files,
-            callback=find_launch_file,
+            help="Launch file; default: launch file of the running graph.", **options.LAUNCH_FILE
         ),
     ] = None,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
     output: Annotated[
-        Path | None, output_file("Drawing to write: .svg image, or .mmd file for Mermaid.")
+        Path | None, options.result_file("Drawing to write: .svg image, or .mmd file for Mermaid.")
     ] = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Print or draw the nodes of a graph, and the topics between them.
 
@@ -67,9 +53,8 @@ def graph(
     if launch_file is None:
         plan, _ = running_graph(run)
     else:
-        plan = load_graph(launch_file, settings=with_scene(settings, scene))
+        plan = load_graph(launch_file, settings=options.with_scene(settings, scene))
     if output is not None:
-        check_folder("--output", output)
         if output.suffix not in (".svg", ".mmd"):
             raise CommandError(f"--output {output}: unknown file type; name a .svg or .mmd file")
         write_file(output, mermaid(plan) if output.suffix == ".mmd" else svg(lay_out(plan)))

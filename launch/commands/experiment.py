@@ -7,27 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    ResultFolderOption,
-    SchedulerOption,
-    SettingsOption,
-    WorkersOption,
-    make_app,
-    split_names,
-    with_scene,
-)
+from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
+    print_columns,
     print_json,
     print_table,
     progress_words,
+    shown,
     words,
 )
 from flexsheet.launch.plans.features import Feature
@@ -39,7 +27,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.experiments.hand_gestures import FeltForce
     from flexsheet.launch.experiments.image import Series
 
-app = make_app("Run the experiments of Furukawa et al. 2007, and further ones, on a graph.")
+app = options.make_app("Run the experiments of Furukawa et al. 2007, and further ones, on a graph.")
 
 StrokeOption = Annotated[
     float,
@@ -67,10 +55,9 @@ MapOption = Annotated[
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
-    """Create and return a folder for an experiment's bag and results.
+    """Create a folder for results, and return its path.
 
-    The folder is `output`; if `output` is None, it is a new folder in runs/ whose name contains
-    `name`.
+    output: path of the folder; None for a new folder in runs/ whose name contains `name`.
     """
     from flexsheet.launch.experiments.run import new_folder
 
@@ -111,18 +98,17 @@ def stroke(
         bool,
         typer.Option("--radii", help="Also measure strokes on a cylinder of twice the radius."),
     ] = False,
-    workers: WorkersOption = 1,
-    scheduler: SchedulerOption = None,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    workers: options.WorkersOption = 1,
+    scheduler: options.SchedulerOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     without: Annotated[
         list[Feature] | None,
         typer.Option(
-            "--without",
             help="Part of the display to omit: the projected image or the rendered force. Without "
-            "the image, frame latencies are null. Not with several strokes or variants.",
+            "the image, frame latencies are null. Not with several strokes or variants."
         ),
     ] = None,
     switches: Annotated[
@@ -135,15 +121,15 @@ def stroke(
             "camera. Not with several strokes.",
         ),
     ] = 0,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate a finger that strokes a cylinder over 60 degrees, and measure the sheet's errors.
 
-    This is the experiment of Furukawa et al. 2007, section V and Table I. To continue a command
-    with several strokes or variants that was interrupted, repeat it with the same --output.
+    Furukawa et al. 2007 describe this experiment in section V and Table I. To continue an
+    interrupted command with several strokes or variants, repeat it with the same --output.
     """
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     if radii and scene is not None:
         raise CommandError("--radii uses the cylinder scenes of the package; remove --scene")
     if repeats > 1 or ablations or radii:
@@ -206,12 +192,12 @@ def tilt(
     *,
     map_file: MapOption = None,
     both_eyes: BothEyesOption = False,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure image errors on a tilted sheet (Furukawa et al. 2007, section VI-B, Fig. 11)."""
     from flexsheet.launch.experiments.image import TILT
@@ -221,7 +207,7 @@ def tilt(
         TILT,
         bag,
         launch_file,
-        with_scene(settings, scene),
+        options.with_scene(settings, scene),
         map_file=map_file,
         both_eyes=both_eyes,
         apparatus=apparatus,
@@ -254,12 +240,12 @@ def push(
     ] = 0.0,
     map_file: MapOption = None,
     both_eyes: BothEyesOption = False,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure image errors on a pushed sheet (Furukawa et al. 2007, section VI-C, Fig. 13).
 
@@ -271,7 +257,7 @@ def push(
 
     settings = [
         *make_settings(launch_file, "planner", "compliance_mode=stiffness"),
-        *with_scene(settings, scene),
+        *options.with_scene(settings, scene),
     ]
     bag = make_result_folder(output, "push") / "push.mcap"
     _measure_images(
@@ -290,10 +276,10 @@ def push(
 @app.command(epilog=examples("flexsheet experiment compliance --output runs/soft"))
 def compliance(
     *,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     complete_table: Annotated[
         bool,
         typer.Option(
@@ -302,8 +288,8 @@ def compliance(
             "the coarse table, if the complete one is not in the cache.",
         ),
     ] = False,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Compare the force on the finger with the force of the virtual object at several push depths.
 
@@ -319,7 +305,7 @@ def compliance(
     with progress_words() as progress:
         table: TableMethod = "nonlinear_table" if complete_table else "quick_table"
         procedure = experiment.make_compliance_procedure(progress, table)
-        given = with_scene(settings, scene)
+        given = options.with_scene(settings, scene)
         run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
         draw_compliance(result, image)
@@ -327,25 +313,19 @@ def compliance(
         print_json({**result, "figure": str(image)})
         return
     columns = {
-        "position": "at",
-        "depth, mm": "depth_mm",
-        "reference, N": "reference_n",
-        "wanted, N": "wanted_n",
-        "felt, N": "felt_n",
-        "error, %": "error_percent",
-        "model's, %": "model_error_percent",
-        "model": "method",
-        "offset, mm": "normal_offset_mm",
+        "position": ("at", ""),
+        "depth, mm": ("depth_mm", ".2f"),
+        "reference, N": ("reference_n", ".2f"),
+        "wanted, N": ("wanted_n", ".2f"),
+        "felt, N": ("felt_n", ".2f"),
+        "error, %": ("error_percent", ".2f"),
+        "model's, %": ("model_error_percent", ".2f"),
+        "model": ("method", ""),
+        "offset, mm": ("normal_offset_mm", ".2f"),
     }
-    columns |= {"measured, N": "measured_n"} if "measured_n" in result["rows"][0] else {}
-    cells = [
-        [
-            cell if isinstance(cell, str) else "–" if cell is None else f"{cell:.2f}"
-            for cell in (row[key] for key in columns.values())
-        ]
-        for row in result["rows"]
-    ]
-    print_table(list(columns), cells)
+    if "measured_n" in result["rows"][0]:
+        columns["measured, N"] = ("measured_n", ".2f")
+    print_columns(result["rows"], columns)
     words.print(f"errors are relative to {result['reference']}")
     for place in result["against_reference"]:
         words.print(
@@ -436,12 +416,12 @@ def gestures(
             autocompletion=complete.gestures,
         ),
     ] = None,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the accuracy of fingertip tracking during simulated human gestures.
 
@@ -451,11 +431,11 @@ def gestures(
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments.run import run_experiment
 
-    selected = select_names(split_names(names), experiment.GESTURES, "gesture")
+    selected = select_names(options.split_names(names), experiment.GESTURES, "gesture")
     bag = make_result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.make_gestures_procedure(selected, progress)
-        given = with_scene(settings, scene)
+        given = options.with_scene(settings, scene)
         run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.gestures_result(bag, selected)
     if as_json:
@@ -468,10 +448,6 @@ def gestures(
 
 def _print_gestures(results: list[dict[str, Any]]) -> None:
     """Print a table of tracking errors (mm) and delays (ms), one line per gesture."""
-
-    def shown(value: float | None, form: str) -> str:
-        return "-" if value is None else format(value, form)
-
     columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
     for each in results[0]["prediction"][1:]:
         columns += [f"+{each['horizon_ms']:.0f} ms rms", "lag, ms"]
@@ -493,19 +469,16 @@ def print_followed(results: list[dict[str, Any]]) -> None:
     Δd and Δθ are the distance and the angle between the true sheet and the true finger in contact.
     """
 
-    def shown(values: dict[str, float] | None) -> list[str]:
-        if values is None:
-            return ["-", "-", "-"]
-        return [f"{values[key]:.3f}" for key in ("mean", "p95", "max")]
-
     columns = ["path", "in contact", "followed", "drop-outs", "true Δd, mm: mean", "95 %", "max"]
     columns += ["true Δθ, °: mean", "95 %", "max"]
     rows = []
     for result in results:
         ratio, contact = result["following_ratio"], result["contact"]
         row = [result["path"], f"{result['contact_ratio']:.1%}"]
-        row += ["-" if ratio is None else f"{ratio:.1%}", str(result["drop_outs"])]
-        row += shown(contact["true_delta_d_mm"]) + shown(contact["true_delta_theta_deg"])
+        row += [shown(ratio, ".1%"), str(result["drop_outs"])]
+        for key in ("true_delta_d_mm", "true_delta_theta_deg"):
+            errors = contact[key] or dict.fromkeys(("mean", "p95", "max"))
+            row += [shown(errors[name], ".3f") for name in ("mean", "p95", "max")]
         rows.append(row)
     print_table(columns, rows)
 
@@ -530,10 +503,9 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
 
 def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print one line per variant, with the mean errors over all strokes and their 95 %
-    intervals."""
+    """Print the mean errors of each variant over all strokes, with their 95 % intervals."""
 
-    def shown(found: dict[str, Any] | None) -> str:
+    def with_interval(found: dict[str, Any] | None) -> str:
         if found is None:
             return "-"
         if found["interval"] is None:
@@ -542,13 +514,11 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
 
     columns = ["variant", "strokes", "Δd, mm", "Δθ, °", "true Δd, mm", "true Δθ, °"]
     keys = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
-    print_table(
-        columns,
-        [
-            [row["variant"], row["strokes"], *(shown(row[key]) for key in keys)]
-            for row in table["rows"]
-        ],
-    )
+    cells = [
+        [row["variant"], row["strokes"], *(with_interval(row[key]) for key in keys)]
+        for row in table["rows"]
+    ]
+    print_table(columns, cells)
     for row in table["rows"]:
         for error in row["failed"]:
             words.print(f"{row['variant']}: a stroke failed: {error}")
@@ -564,13 +534,13 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
 )
 def stability(
     *,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
     hands: Annotated[
-        int, typer.Option(metavar="N", min=1, max=100, help="Number of random hands per kind.")
+        int, typer.Option(min=1, max=100, help="Number of random hands per kind.")
     ] = 4,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the hands.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the hands.")] = 100,
     gestures: Annotated[
         bool,
         typer.Option(
@@ -587,9 +557,9 @@ def stability(
             "gestures run in simulated time.",
         ),
     ] = False,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate whether a hand in contact with the sheet starts to oscillate.
 
@@ -611,7 +581,7 @@ def stability(
         raise CommandError(
             "--graph requires --gestures, and --apparatus requires --gestures and --graph; add them"
         )
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
@@ -663,8 +633,7 @@ def _report_gestures(
     *,
     as_json: bool,
 ) -> None:
-    """Write the result and the figure of `experiment stability --gestures`, and print the
-    results."""
+    """Write the result and the figure of `experiment stability --gestures`, and print a table."""
     import json
 
     from flexsheet.launch.experiments.pictures import draw_hand_gestures
@@ -675,25 +644,20 @@ def _report_gestures(
     if as_json:
         print_json({**result, "picture": str(image)})
         return
-    columns = ["gesture", "mass, g", "stiffness, N/m", "peak force, N", "error, N: peak", "mean"]
-    columns += ["median, %", "transient, N", "touches", "chatter", "watchdog"]
-    print_table(
-        columns,
-        [
-            [
-                row["gesture"],
-                f"{1e3 * row['mass_kg']:.0f}",
-                f"{row['stiffness_n_per_m']:.0f}",
-                f"{row['peak_force_n']:.2f}",
-                f"{row['peak_error_n']:.2f}",
-                f"{row['mean_error_n']:.3f}",
-                f"{row['median_error_percent']:.0f}",
-                f"{row['transient_n']:.2f}",
-                row["touches"],
-                row["chatter"],
-                row["watchdog_triggers"],
-            ]
-            for row in result["gestures"]
-        ],
+    print_columns(
+        result["gestures"],
+        {
+            "gesture": ("gesture", ""),
+            "mass, kg": ("mass_kg", ".3f"),
+            "stiffness, N/m": ("stiffness_n_per_m", ".0f"),
+            "peak force, N": ("peak_force_n", ".2f"),
+            "error, N: peak": ("peak_error_n", ".2f"),
+            "mean": ("mean_error_n", ".3f"),
+            "median, %": ("median_error_percent", ".0f"),
+            "transient, N": ("transient_n", ".2f"),
+            "touches": ("touches", ""),
+            "chatter": ("chatter", ""),
+            "watchdog": ("watchdog_triggers", ""),
+        },
     )
     words.print(f"image: {image}")

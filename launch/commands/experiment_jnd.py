@@ -9,16 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.experiment import make_result_folder
-from flexsheet.launch.commands.options import (
-    DEMO,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    ResultFolderOption,
-    SettingsOption,
-    with_scene,
-)
+from flexsheet.launch.commands import options
+from flexsheet.launch.commands.experiment import app, make_result_folder
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
@@ -33,33 +25,24 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `jnd` to `flexsheet experiment`."""
-    app.command(
-        epilog=examples(
-            "flexsheet experiment jnd --participant k7x2 --output runs/jnd",
-            "flexsheet experiment jnd --simulated-participant --repeats 20 --seed 100",
-        )
-    )(jnd)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet experiment jnd --participant k7x2 --output runs/jnd",
+        "flexsheet experiment jnd --simulated-participant --repeats 20 --seed 100",
+    )
+)
 def jnd(
     *,
     participant: Annotated[
         str,
         typer.Option(
-            "--participant",
-            metavar="CODE",
-            help="Random code that identifies the participant; do not use a name.",
+            metavar="CODE", help="Random code that identifies the participant; do not use a name."
         ),
     ] = "p1",
-    seed: Annotated[
-        int, typer.Option("--seed", metavar="N", min=0, help="Random seed of the order of objects.")
-    ] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the order of objects.")] = 1,
     trials: Annotated[
         int,
         typer.Option(
-            metavar="N",
             min=20,
             max=2000,
             help="Number of trials; in each trial, the participant compares two objects.",
@@ -89,11 +72,11 @@ def jnd(
             "--seed, the next ones the following seeds. Seeds 0-99 are for development.",
         ),
     ] = 1,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure a participant's Weber fraction of stiffness with pairs of soft objects.
 
@@ -112,7 +95,7 @@ def jnd(
         raise CommandError(
             "--repeats requires --simulated-participant; add it, or remove --repeats"
         )
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "jnd")
     reference = _choose_reference_pa(loaded, reference_pa)
@@ -227,9 +210,9 @@ def _write_result(row: dict[str, Any], folder: Path) -> None:
 
 
 def _summarize(rows: list[dict[str, Any]], reference_pa: float) -> dict[str, Any]:
-    """Return the results of the trials `rows` for `flexsheet experiment jnd --json`.
+    """Return the JSON output of `flexsheet experiment jnd`.
 
-    reference_pa: Young's modulus of the reference object.
+    rows: one row per participant. reference_pa: Young's modulus of the reference object.
     """
     import numpy as np
 

@@ -11,69 +11,42 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
+from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.experiment import (
     StrokeOption,
+    app,
     make_result_folder,
     print_followed,
-)
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    CalibratedOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    ProfileOption,
-    ResultFolderOption,
-    SchedulerOption,
-    SettingsOption,
-    WorkersOption,
-    split_names,
-    with_scene,
 )
 from flexsheet.launch.commands.output import (
     examples,
     print_json,
     print_table,
     progress_words,
+    shown,
     words,
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands `robustness`, `sensitivity` and `follow` to `flexsheet experiment`."""
-    app.command(
-        epilog=examples(
-            "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
-            "flexsheet experiment robustness --seeds 0-29 --profile paper --calibrated --json",
-            "flexsheet experiment robustness --seeds 0-3 --commissioned",
-        )
-    )(robustness)
-    app.command(
-        epilog=examples(
-            "flexsheet experiment sensitivity --calibrated",
-            "flexsheet experiment sensitivity --parameter sheet.modulus_ratio --json",
-        )
-    )(sensitivity)
-    app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))(
-        follow
+@app.command(
+    epilog=examples(
+        "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
+        "flexsheet experiment robustness --seeds 0-29 --profile paper --calibrated --json",
+        "flexsheet experiment robustness --seeds 0-3 --commissioned",
     )
-
-
+)
 def robustness(
     *,
     seeds: Annotated[
         str,
         typer.Option(
-            "--seeds",
             metavar="A-B",
             help="Range of random seeds; each seed sets the errors of one simulated hardware. "
             "Seeds 0-99 are for development, higher seeds for reports.",
         ),
     ],
-    profile: ProfileOption = "modern",
-    calibrated: CalibratedOption = False,
+    profile: options.ProfileOption = "modern",
+    calibrated: options.CalibratedOption = False,
     commissioned: Annotated[
         bool,
         typer.Option(
@@ -83,16 +56,16 @@ def robustness(
         ),
     ] = False,
     seconds: StrokeOption = 10.0,
-    workers: WorkersOption = 1,
-    scheduler: SchedulerOption = None,
+    workers: options.WorkersOption = 1,
+    scheduler: options.SchedulerOption = None,
     keep_bags: Annotated[
         bool, typer.Option("--keep-bags", help="Keep the recording of each trial in the folder.")
     ] = False,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
@@ -108,7 +81,7 @@ def robustness(
     with progress_words() as progress:
         result = experiment.run_robustness(
             launch_file,
-            with_scene(settings, scene),
+            options.with_scene(settings, scene),
             folder,
             selected,
             progress,
@@ -126,14 +99,14 @@ def robustness(
     rows = [
         [
             row["seed"],
-            *(_shown(row[metric]) for metric in experiment.METRICS),
+            *(shown(row[metric]) for metric in experiment.METRICS),
             ", ".join(row["out_of_tolerance"]) or "-",
             ", ".join(row["flagged"]) or "-",
         ]
         for row in result["rows"]
     ]
     for statistic in ("median", "p95", "worst"):
-        values = [_shown(result["summary"][metric][statistic]) for metric in experiment.METRICS]
+        values = [shown(result["summary"][metric][statistic]) for metric in experiment.METRICS]
         rows.append([statistic, *values, "", ""])
     print_table(["seed", *experiment.METRICS, "out of tolerance", "flagged"], rows)
     if "commissioning" in result:
@@ -153,12 +126,18 @@ def _print_predictions(found: dict[str, Any]) -> None:
     print_table(
         ["report", *(case.replace("_", " ") for case in cases), "stated / true error, median"],
         [
-            [name, *(one[case] for case in cases), _shown(one["stated_over_true"]["median"])]
+            [name, *(one[case] for case in cases), shown(one["stated_over_true"]["median"])]
             for name, one in (every | found["predictions"]).items()
         ],
     )
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet experiment sensitivity --calibrated",
+        "flexsheet experiment sensitivity --parameter sheet.modulus_ratio --json",
+    )
+)
 def sensitivity(
     *,
     parameters: Annotated[
@@ -169,16 +148,16 @@ def sensitivity(
             help="Parameter in the table of tolerances; repeat the option; default: all.",
         ),
     ] = None,
-    profile: ProfileOption = "modern",
-    calibrated: CalibratedOption = False,
+    profile: options.ProfileOption = "modern",
+    calibrated: options.CalibratedOption = False,
     seconds: StrokeOption = 10.0,
-    workers: WorkersOption = 1,
-    scheduler: SchedulerOption = None,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    workers: options.WorkersOption = 1,
+    scheduler: options.SchedulerOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the errors that each hardware parameter causes if only this parameter is inaccurate.
 
@@ -191,13 +170,13 @@ def sensitivity(
     from flexsheet.launch.experiments.pictures import draw_sensitivity
     from flexsheet.nodes.twin.tolerance_table import TOLERANCES, Profile
 
-    selected = select_names(split_names(parameters), TOLERANCES, "parameter")
+    selected = select_names(options.split_names(parameters), TOLERANCES, "parameter")
     folder = make_result_folder(output, "sensitivity")
     image = folder / "sensitivity.png"
     with progress_words() as progress:
         result = experiment.run_sensitivity(
             launch_file,
-            with_scene(settings, scene),
+            options.with_scene(settings, scene),
             folder,
             selected,
             progress,
@@ -214,7 +193,7 @@ def sensitivity(
     metrics = list(result["tolerances"])
     largest = {
         parameter: [
-            _shown(max((abs(row[one]) for row in rows if row[one] is not None), default=None))
+            shown(max((abs(row[one]) for row in rows if row[one] is not None), default=None))
             for one in metrics
         ]
         for parameter in (row["parameter"] for row in result["ranking"])
@@ -242,22 +221,22 @@ def sensitivity(
     words.print(f"image: {image}")
 
 
+@app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))
 def follow(
     *,
     finger_path: Annotated[
         str,
         typer.Option(
-            "--finger-path",
             metavar="NAME_OR_FILE",
             help="CSV file with a recorded fingertip path (columns t_s,x_mm,y_mm,z_mm), or the "
             "name of a gesture.",
             autocompletion=complete.gestures,
         ),
     ],
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     simulated_time: Annotated[
         bool,
         typer.Option(
@@ -265,8 +244,8 @@ def follow(
             help="Run tracking, planning and arms in simulated time instead of in a graph.",
         ),
     ] = False,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the sheet's error while it follows a recorded finger, and compute a lower bound.
 
@@ -276,7 +255,7 @@ def follow(
     from flexsheet.launch.experiments import follow as experiment
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     path = load_path(launch_file, finger_path, given)
     bag = None if simulated_time else make_result_folder(output, "follow") / "follow.mcap"
     with progress_words() as progress:
@@ -287,11 +266,7 @@ def follow(
     print_followed([result])
     bound = result["lower_bound_mm"]
     words.print(
-        f"lower bound of the error: mean {_shown(bound['mean'])} mm, 95 % {_shown(bound['p95'])} mm"
+        f"lower bound of the error: mean {shown(bound['mean'])} mm, 95 % {shown(bound['p95'])} mm"
     )
     if bag is not None:
         words.print(f"bag: {bag}")
-
-
-def _shown(value: Any) -> str:
-    return "-" if value is None else f"{value:.3g}"

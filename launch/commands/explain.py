@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -52,8 +52,7 @@ class Entry:
 
 @cache
 def entries() -> tuple[Entry, ...]:
-    """Return the explanations of all errors, of the nodes' notes, and of texts that the console
-    shows."""
+    """Return the explanations of all errors, notes of nodes, and texts of the console."""
     from flexsheet.messages.notes import (
         FINGERTIP_REMEDIES,
         SELF_CHECK_FINDINGS,
@@ -68,20 +67,21 @@ def entries() -> tuple[Entry, ...]:
         for module in pkgutil.walk_packages(root.__path__, f"{root.__name__}."):
             import_module(module.name)
     errors = {kind.code: kind for kind in _subclasses(FlexsheetError)}
+    tables: tuple[tuple[dict[Any, str], dict[Any, str]], ...] = (
+        ({}, FINGERTIP_REMEDIES),
+        (SHEET_REASON_TEXTS, SHEET_REASON_REMEDIES),
+        (SELF_CHECK_FINDINGS, SELF_CHECK_REMEDIES),
+    )
     return (
         *(
             Entry(code, _meaning(kind), kind.remedy, name=kind.__name__)
             for code, kind in sorted(errors.items())
         ),
         *(Entry(note.code, note.phrase, note.remedy, phrase=note.phrase) for note in NodeNote),
-        *(Entry(reason, "", remedy) for reason, remedy in FINGERTIP_REMEDIES.items()),
         *(
-            Entry(reason, SHEET_REASON_TEXTS[reason], remedy, phrase=SHEET_REASON_TEXTS[reason])
-            for reason, remedy in SHEET_REASON_REMEDIES.items()
-        ),
-        *(
-            Entry(cause, SELF_CHECK_FINDINGS[cause], remedy, phrase=SELF_CHECK_FINDINGS[cause])
-            for cause, remedy in SELF_CHECK_REMEDIES.items()
+            Entry(code, texts.get(code, ""), remedy, phrase=texts.get(code, ""))
+            for texts, remedies in tables
+            for code, remedy in remedies.items()
         ),
     )
 
@@ -100,8 +100,8 @@ def _meaning(kind: type[FlexsheetError]) -> str:
 def find_entries(text: str) -> list[Entry]:
     """Return the explanations of a code, a class name or an error text, with the best match first.
 
-    An error text matches explanations whose class name or phrase it contains. If there are none, it
-    matches explanations with at least MIN_SHARED_WORDS common words, weighted by their rarity.
+    If the text contains no class name and no phrase, it is compared word by word. Explanations with
+    at least MIN_SHARED_WORDS common words match, and rare words have more weight.
     """
     code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
     if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:

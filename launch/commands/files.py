@@ -39,9 +39,7 @@ PATTERNS = {
 
 @app.command(epilog=examples("flexsheet files", "flexsheet files docker --json"))
 def files(
-    kind: Annotated[
-        FileKind | None, typer.Argument(metavar="KIND", help="Kind of files; default: all.")
-    ] = None,
+    kind: Annotated[FileKind | None, typer.Argument(help="Kind of files; default: all.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List launch files, scenes, calibrations, layouts, systemd units and Compose files.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,10 @@ from flexsheet.launch.commands.output import FAILED, CommandError, words
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
-    from flexsheet.launch.plans.plan_model import ResolvedGraph
+    from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
     from flexsheet.launch.running.runs import Run
+    from flexsheet.messages.bus import Subscriber
+    from flexsheet.nodes.runner import NodeConfig
 
 
 class NoGraphError(CommandError):
@@ -52,6 +55,52 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
     return ResolvedGraph.model_validate_json(run.plan_file.read_text()), run
 
 
+def find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:
+    """Return a node of a graph; raise CommandError if the graph has no such node."""
+    from flexsheet.launch.plans.documents import did_you_mean
+
+    if name not in plan.nodes:
+        raise CommandError(
+            f'"{name}": unknown node of {plan.launch_file}; {did_you_mean(name, list(plan.nodes))}'
+        )
+    return plan.nodes[name]
+
+
+def list_readers(plan: ResolvedGraph, topic: str) -> list[str]:
+    """Return the names of the nodes that read a topic."""
+    return [
+        node.name
+        for node in plan.nodes.values()
+        if any(port.topic == topic for port in node.inputs)
+    ]
+
+
+@contextmanager
+def receiving(subscribers: Sequence[Subscriber]) -> Iterator[None]:
+    """Receive messages in the running event loop until the context ends."""
+    try:
+        for each in subscribers:
+            each.start()
+        yield
+    finally:
+        for each in subscribers:
+            each.close()
+
+
+async def run_node_here(config: NodeConfig, duration_s: float | None) -> None:
+    """Run a node in this process until the task is cancelled or the duration has passed."""
+    from flexsheet.nodes.runner import run_node
+
+    stop = asyncio.Event()
+    work = asyncio.create_task(run_node(config, stop))
+    try:
+        await asyncio.wait((work,), timeout=duration_s)
+    finally:
+        # Also after an interruption, wait until the node has ended.
+        stop.set()
+        await work
+
+
 async def receive_until(
     plan: ResolvedGraph,
     run: Run,
@@ -76,25 +125,15 @@ async def receive_until(
         return receive
 
     subscribers = [
-        make_subscriber(
-            topic,
-            plan,
-            run,
-            make_handler(handle),
-            on_problem=words.print,
-        )
+        make_subscriber(topic, plan, run, make_handler(handle), on_problem=words.print)
         for topic, handle in handlers.items()
     ]
-    for each in subscribers:
-        each.start()
-    try:
-        async with asyncio.timeout(timeout_s):
-            await satisfied.wait()
-    except TimeoutError:
-        return False
-    finally:
-        for each in subscribers:
-            each.close()
+    with receiving(subscribers):
+        try:
+            async with asyncio.timeout(timeout_s):
+                await satisfied.wait()
+        except TimeoutError:
+            return False
     return True
 
 

@@ -13,7 +13,8 @@ from flexsheet.launch.commands.output import (
     CommandError,
     examples,
     print_json,
-    print_table,
+    print_outcome,
+    print_rows,
     words,
 )
 
@@ -56,16 +57,13 @@ def new(
     import re
 
     from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import SecurityError, make_key_pair, write_secret
+    from flexsheet.messages.security import make_key_pair, write_secret
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
         raise CommandError(f'"{host}": invalid host name; use lower-case letters, digits and _')
     public, secret = make_key_pair()
     file = secret_file(host)
-    try:
-        write_secret(file, secret, replace=replace)
-    except SecurityError as error:
-        raise CommandError(str(error), FAILED) from error
+    write_secret(file, secret, replace=replace)
     words.print(f"secret key: {file}; do not copy it to another computer")
     words.print(f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'")
     if as_json:
@@ -77,10 +75,7 @@ def new(
 @app.command(epilog=examples("flexsheet keys show", "flexsheet keys show left"))
 def show(
     host: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="HOST", help="Name of the host in the launch file; default: all hosts."
-        ),
+        str | None, typer.Argument(help="Name of the host in the launch file; default: all hosts.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -109,9 +104,8 @@ def show(
         print_json({"keys": rows, "problems": problems})
     elif host and rows:
         print(rows[0]["public"])
-    elif rows:
-        columns = ("host", "public", "secret_file")
-        print_table(columns, [tuple(row[name] for name in columns) for row in rows])
+    else:
+        print_rows(rows, as_json=False)
     for problem in problems:
         words.print(problem)
     if problems:
@@ -128,10 +122,7 @@ def install(
     launch_file: LaunchArgument,
     host: HostArgument,
     key: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="KEY", help="Public key; default: key of HOST stored on this computer."
-        ),
+        str | None, typer.Argument(help="Public key; default: key of HOST stored on this computer.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -141,15 +132,13 @@ def install(
     """
     from flexsheet.launch.running.keys import install as install_key
     from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
+    from flexsheet.messages.security import derive_public_key, read_secret
 
     if key is None:
-        try:
-            key = derive_public_key(read_secret(secret_file(host)))
-        except SecurityError as error:
-            raise CommandError(str(error), FAILED) from error
+        key = derive_public_key(read_secret(secret_file(host)))
     install_key(launch_file, host, key)
-    if as_json:
-        print_json({"launch_file": str(launch_file), "host": host, "public": key})
-    else:
-        words.print(f"{launch_file}: hosts.{host}.key = {key}")
+    print_outcome(
+        {"launch_file": str(launch_file), "host": host, "public": key},
+        f"{launch_file}: hosts.{host}.key = {key}",
+        as_json=as_json,
+    )

@@ -11,17 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import (
-    ApparatusOption,
-    DurationOption,
-    JsonOption,
-    LaunchArgument,
-    OtherSceneOption,
-    SettingsOption,
-    make_app,
-    with_scene,
-)
+from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands.graph import list_readers
 from flexsheet.launch.commands.output import (
     FAILED,
     examples,
@@ -38,7 +29,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.launch.running.supervisor import RunningGraph
 
-app = make_app()
+app = options.make_app()
 
 LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 
@@ -54,8 +45,8 @@ LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 )
 def launch(
     *,
-    launch_file: LaunchArgument,
-    scene: OtherSceneOption = None,
+    launch_file: options.LaunchArgument,
+    scene: options.OtherSceneOption = None,
     host: Annotated[
         str | None,
         typer.Option(
@@ -72,12 +63,11 @@ def launch(
             help="Check the launch file and print the resolved graph without starting it.",
         ),
     ] = False,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     without: Annotated[
         list[str] | None,
         typer.Option(
-            "--without",
             metavar="NODE",
             help="Node to omit, so that `flexsheet run NODE` can start it; repeat the option for "
             "several nodes.",
@@ -91,11 +81,10 @@ def launch(
         ),
     ] = None,
     console: Annotated[
-        bool,
-        typer.Option("--console", help="Add a browser console and a recorder to the graph."),
+        bool, typer.Option("--console", help="Add a browser console and a recorder to the graph.")
     ] = False,
-    duration: DurationOption = None,
-    as_json: JsonOption = False,
+    duration: options.DurationOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Start the nodes of a launch file and supervise them until Ctrl-C.
 
@@ -109,7 +98,7 @@ def launch(
 
     plan = load_graph(
         launch_file,
-        settings=with_scene(settings, scene),
+        settings=options.with_scene(settings, scene),
         record=record,
         console=console,
         apparatus=apparatus,
@@ -166,10 +155,7 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """Start a check of the hand-sheet stability in a thread, if the planner runs on `host`.
-
-    The check takes half a second, and prints a warning if sheet and hand may oscillate.
-    """
+    """Check in a thread whether sheet and hand may oscillate, if the planner runs on `host`."""
     if any(
         issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
     ):
@@ -177,7 +163,7 @@ def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
-    """Print the nodes of the launch file that the graph omits, and the reason for each omission.
+    """Print the nodes that the graph omits, and the reason for each omission.
 
     host: host whose nodes are printed; None for all hosts.
     """
@@ -200,8 +186,8 @@ async def run_graph(
 
     The second signal logs the nodes that have not exited, and the third signal kills these nodes.
 
-    duration_s: time after which the graph is stopped, measured from the moment when all nodes are
-    ready; None for no limit. without: names of nodes that are not started.
+    duration_s: maximum time after all nodes are ready; None for no limit. without: names of nodes
+    that are not started. when_ready: function that is called when all nodes are ready.
     """
     from flexsheet.launch.running.supervisor import RunningGraph
 
@@ -219,14 +205,11 @@ async def run_graph(
         elif signals > 2:
             graph.kill_all()
 
-    with handle_signals(on_signal, *_list_end_signals()):
+    handled = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        handled.append(signal.SIGHUP)
+    with handle_signals(on_signal, *handled):
         return await _run_until(graph, stop_requested, duration_s, when_ready)
-
-
-def _list_end_signals() -> list[int]:
-    """Return the signals that stop a graph: SIGINT, SIGTERM, and SIGHUP unless it is ignored."""
-    hung_up = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
-    return [signal.SIGINT, signal.SIGTERM, *hung_up]
 
 
 async def _run_until(
@@ -235,11 +218,7 @@ async def _run_until(
     duration_s: float | None,
     when_ready: Callable[[Run], None],
 ) -> int:
-    """Run a graph until `stop_requested` is set or its duration has passed; return the exit code.
-
-    duration_s: maximum time after all nodes are ready; None for no limit. when_ready: function that
-    is called when all nodes are ready.
-    """
+    """Run a graph until a stop is requested or the duration has passed; return the exit code."""
     from flexsheet.launch.running.supervisor import NodeFailedError
     from flexsheet.launch.running.systemd import beat_watchdog, notify_systemd
 
@@ -289,29 +268,24 @@ def format_log_line(line: str) -> tuple[str, str]:
 
     If the line is a JSON record, the text consists of its event, other fields and stack trace.
     """
-    style, text = "", line
-    if line.startswith("{"):
-        try:
-            record = json.loads(line)
-        except ValueError:
-            record = None
-        if isinstance(record, dict) and "event" in record:
-            style = LEVEL_STYLES.get(str(record.pop("level", "")), "")
-            record.pop("timestamp", None)
-            record.pop("node", None)
-            event = record.pop("event")
-            trace = record.pop("exception", None)
-            text = " ".join([str(event), *(f"{key}={value}" for key, value in record.items())])
-            if trace:
-                text += f"\n{trace}"
-    return style, text
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return "", line
+    if not isinstance(record, dict) or "event" not in record:
+        return "", line
+    style = LEVEL_STYLES.get(str(record.pop("level", "")), "")
+    event, trace = record.pop("event"), record.pop("exception", None)
+    fields = (
+        f" {key}={value}" for key, value in record.items() if key not in ("timestamp", "node")
+    )
+    return style, f"{event}{''.join(fields)}" + (f"\n{trace}" if trace else "")
 
 
 def _format_settings(node: ResolvedNode) -> str:
     """Return "name=value" for all parameters of a node that differ from their defaults."""
     from pydantic_core import to_jsonable_python
 
-    from flexsheet.nodes import node_class
     from flexsheet.nodes.node import find_parameters_type
 
     fields = find_parameters_type(node_class(node.type)).model_fields
@@ -359,11 +333,7 @@ def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
                 topic,
                 writer.name,
                 " ".join(writer.endpoints),
-                " ".join(
-                    node.name
-                    for node in plan.nodes.values()
-                    if any(port.topic == topic for port in node.inputs)
-                ),
+                " ".join(list_readers(plan, topic)),
             )
             for topic, writers in plan.writers.items()
             for writer in writers

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -16,9 +16,6 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_rows,
 )
-
-if TYPE_CHECKING:
-    from flexsheet.launch.plans.plan_model import ResolvedNode
 
 app = make_app("List nodes and node types, and describe their ports and parameters.")
 
@@ -62,6 +59,7 @@ def info(
 
     For a node of the running graph, the connected topics and the parameter values are also printed.
     """
+    from flexsheet.messages.field_types import describe_field
     from flexsheet.nodes import UnknownNodeError, node_class
     from flexsheet.nodes.node import find_parameters_type, find_ports, find_timers
 
@@ -74,53 +72,33 @@ def info(
         class_ = node_class(node_type)
     except (UnknownNodeError, ImportError, AttributeError) as error:
         raise CommandError(str(error)) from error
-    description = {
-        **({} if found is None else {"node": node, "host": found.host}),
-        "type": node_type,
-        "about": (class_.__doc__ or "").strip(),
-        "ports": [
-            {
-                "port": port.name,
-                "direction": port.direction,
-                "message": port.message.__name__,
-                **({} if found is None else {"topic": _find_topic(found, port.name)}),
-            }
-            for port in find_ports(class_).values()
-        ],
-        "timers": [
-            {"method": timer.method, "rate_parameter": timer.rate_parameter}
-            for timer in find_timers(class_)
-        ],
-        "parameters": [
-            {
-                **_parameter(name, field),
-                **({} if found is None else {"value": found.parameters.get(name)}),
-            }
-            for name, field in find_parameters_type(class_).model_fields.items()
-        ],
-    }
+    fields = {"type": node_type, "about": (class_.__doc__ or "").strip()}
+    ports: list[dict[str, Any]] = [
+        {"port": port.name, "direction": port.direction, "message": port.message.__name__}
+        for port in find_ports(class_).values()
+    ]
+    timers = [
+        {"method": timer.method, "rate_parameter": timer.rate_parameter}
+        for timer in find_timers(class_)
+    ]
+    parameters: list[dict[str, Any]] = [
+        {"parameter": name, **describe_field(field)}
+        for name, field in find_parameters_type(class_).model_fields.items()
+    ]
+    if found is not None:
+        fields = {"node": node, "host": found.host, **fields}
+        connected = {
+            one.port: one.topic for one in (*found.inputs, *found.outputs) if one.endpoints
+        }
+        for port in ports:
+            port["topic"] = connected.get(port["port"])
+        for parameter in parameters:
+            parameter["value"] = found.parameters.get(parameter["parameter"])
     if as_json:
-        print_json(description)
+        print_json({**fields, "ports": ports, "timers": timers, "parameters": parameters})
         return
-    print_fields(
-        (name, str(value).split("\n")[0])
-        for name, value in description.items()
-        if isinstance(value, str)
-    )
-    for title in ("ports", "timers", "parameters"):
-        rows: Any = description[title]
+    print_fields((name, value.split("\n")[0]) for name, value in fields.items())
+    for rows in (ports, timers, parameters):
         if rows:
             print()
             print_rows(rows, as_json=False)
-
-
-def _find_topic(node: ResolvedNode, port: str) -> str | None:
-    """Return the topic to which a port of a node is connected; None if it is not connected."""
-    ports = (*node.inputs, *node.outputs)
-    return next((one.topic for one in ports if one.port == port and one.endpoints), None)
-
-
-def _parameter(name: str, field: Any) -> dict[str, str]:
-    from flexsheet.messages.field_types import describe_field
-
-    return {"parameter": name, **describe_field(field)}

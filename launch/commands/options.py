@@ -1,7 +1,6 @@
 """Declare the command-line arguments and options that several commands share.
 
-The help shows the value of an option as a placeholder in capital letters, such as FILE. The
-function `name_values` sets the placeholder of options that declare none.
+In the help, a placeholder such as FILE represents the value of an option.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file
 
 DEMO, CYLINDER = Path("demo"), Path("cylinder")
@@ -65,52 +65,28 @@ def find_scene(given: Path | None) -> Path | None:
     return None if given is None else find_file(given, SCENES)
 
 
-LaunchArgument = Annotated[
-    Path,
-    typer.Argument(
-        metavar="LAUNCH_FILE",
-        help="Path of a launch file, or name of one in the package, such as demo.",
-        autocompletion=complete.launch_files,
-        callback=find_launch_file,
-    ),
-]
-LaunchOption = Annotated[
-    Path,
-    typer.Option(
-        "--launch",
-        metavar="LAUNCH_FILE",
-        help="Path of a launch file, or name of one in the package, such as demo.",
-        autocompletion=complete.launch_files,
-        callback=find_launch_file,
-    ),
-]
-SceneArgument = Annotated[
-    Path,
-    typer.Argument(
-        metavar="SCENE",
-        help="Path of a scene file, or name of one in the package, such as organ.",
-        autocompletion=complete.scenes,
-        callback=find_scene,
-    ),
-]
-SceneOption = Annotated[
-    Path,
-    typer.Option(
-        "--scene",
-        metavar="SCENE",
-        help="Path of a scene file, or name of one in the package, such as cylinder.",
-        autocompletion=complete.scenes,
-        callback=find_scene,
-    ),
-]
+LAUNCH_FILE: dict[str, Any] = {
+    "metavar": "LAUNCH_FILE",
+    "autocompletion": complete.launch_files,
+    "callback": find_launch_file,
+}
+SCENE: dict[str, Any] = {
+    "metavar": "SCENE",
+    "autocompletion": complete.scenes,
+    "callback": find_scene,
+}
+"""The settings that all arguments and options for launch files or for scenes have in common."""
+
+_LAUNCH_HELP = "Path of a launch file, or name of one in the package, such as demo."
+_SCENE_HELP = "Path of a scene file, or name of one in the package, such as cylinder."
+LaunchArgument = Annotated[Path, typer.Argument(help=_LAUNCH_HELP, **LAUNCH_FILE)]
+LaunchOption = Annotated[Path, typer.Option("--launch", help=_LAUNCH_HELP, **LAUNCH_FILE)]
+SceneArgument = Annotated[Path, typer.Argument(help=_SCENE_HELP, **SCENE)]
+SceneOption = Annotated[Path, typer.Option("--scene", help=_SCENE_HELP, **SCENE)]
 OtherSceneOption = Annotated[
     Path | None,
     typer.Option(
-        "--scene",
-        metavar="SCENE",
-        help="Scene to use instead of the scene that the launch file names.",
-        autocompletion=complete.scenes,
-        callback=find_scene,
+        "--scene", help="Scene to use instead of the scene that the launch file names.", **SCENE
     ),
 ]
 SettingsOption = Annotated[
@@ -137,8 +113,8 @@ TwinApparatusOption = Annotated[
         "--apparatus",
         metavar="FILE|seed:N",
         help="With --twin: file with the true parameters of the simulated hardware, or a random "
-        "sample. Default: the parameters of the scene; for arms and projector, random deviations "
-        "from the scene, which --seed determines.",
+        "sample such as seed:7. Default: the parameters of the scene; for arms and projector, "
+        "random deviations from the scene, which --seed determines.",
     ),
 ]
 RunOption = Annotated[
@@ -222,16 +198,34 @@ CalibratedOption = Annotated[
     ),
 ]
 SeedOption = Annotated[
-    int, typer.Option("--seed", metavar="N", help="Random seed of the simulation.")
+    int,
+    typer.Option(
+        "--seed",
+        metavar="N",
+        help="Random seed of the simulated measurements, such as poses and noise. The errors of "
+        "the simulated hardware have another seed, which --apparatus seed:N sets.",
+    ),
 ]
 
 
-def output_file(text: str, metavar: str = "FILE") -> Any:
+def output_file(text: str, metavar: str = "FILE", **settings: Any) -> Any:
     """Return the declaration of the option -o/--output.
 
-    text: help of the option. metavar: placeholder for its value.
+    text: help of the option. metavar: placeholder of the value in the help.
     """
-    return typer.Option("-o", "--output", metavar=metavar, help=text)
+    return typer.Option("-o", "--output", metavar=metavar, help=text, **settings)
+
+
+def result_file(text: str, metavar: str = "FILE") -> Any:
+    """Return the declaration of the option -o/--output for a file in an existing folder."""
+    return output_file(text, metavar, callback=check_folder)
+
+
+def check_folder(file: Path | None) -> Path | None:
+    """Return an output file; raise CommandError if its parent folder does not exist."""
+    if file is not None and not file.resolve().parent.is_dir():
+        raise CommandError(f"{file}: the folder {file.parent} does not exist; create it")
+    return file
 
 
 def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
@@ -240,9 +234,9 @@ def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
 
 
 def split_names(given: list[str] | None) -> list[str]:
-    """Return the values of a repeated option, also if they are given as "A,B" (the former format).
+    """Return the values of a repeated option; split values in the former format "A,B".
 
-    Raises BadParameter if the option is given but contains no name.
+    Raises BadParameter if the option is given without a name.
     """
     names = [name.strip() for one in given or () for name in one.split(",") if name.strip()]
     if given and not names:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.units import UNITS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -26,8 +27,7 @@ PROGRESS_LINE_S = 2.0
 
 
 class CommandError(FlexsheetError):
-    """Raised to end a command with an error text and an exit code, for instance for a wrong
-    option."""
+    """Raised to end a command with an error text and an exit code."""
 
     code = "command"
     remedy = "Correct the option or file that the error names."
@@ -37,20 +37,11 @@ class CommandError(FlexsheetError):
         self.exit_code = exit_code
 
 
-def check_folder(option: str, file: Path) -> None:
-    """Raise CommandError if the parent folder of an output file does not exist.
-
-    option: command-line option that names the file, for the error text.
-    """
-    if not file.resolve().parent.is_dir():
-        raise CommandError(f"{option} {file}: the folder {file.parent} does not exist; create it")
-
-
 class Words:
     """A printer of messages for the user on stderr.
 
-    Colours and status lines are used only in terminals; the environment variable NO_COLOR disables
-    colours. The module rich is imported with the first message, so that commands start fast.
+    Colours and status lines are used only in terminals. The environment variable NO_COLOR disables
+    colours. The module rich is imported with the first message, because its import is slow.
     """
 
     @cached_property
@@ -86,8 +77,7 @@ def examples(*lines: str) -> str:
 
 
 def examples_in(epilog: str | None) -> list[str]:
-    """Return the example command lines in a help epilog that the function `examples` has
-    formatted."""
+    """Return the example command lines in the epilog of a command's help."""
     heading, *lines = (epilog or "").split("\n")
     return [line.replace(r"\[", "[") for line in lines] if heading == EXAMPLES else []
 
@@ -100,6 +90,14 @@ def print_json(data: Any) -> None:
 def print_json_line(data: Any) -> None:
     """Print a JSON document on one line of stdout and flush it; NaN and infinity become null."""
     print(json.dumps(replace_non_finite(data), allow_nan=False), flush=True)
+
+
+def print_outcome(data: Any, text: str, *, as_json: bool) -> None:
+    """Print data as JSON on stdout, or a text for the user on stderr."""
+    if as_json:
+        print_json(data)
+    else:
+        words.print(text)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -116,18 +114,41 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
         print(f"\x1b[1m{line}\x1b[0m" if in_terminal and number == 0 else line)
 
 
-def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
-    """Print rows with the same keys on stdout, as JSON or as a table; None is shown as "-"."""
+def shown(value: float | None, form: str = ".3g") -> str:
+    """Format a number; return "-" for None."""
+    return "-" if value is None else format(value, form)
+
+
+def print_columns(
+    rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]
+) -> None:
+    """Print a table with selected values of the rows; None is shown as "-".
+
+    columns: key and format of the values in each column, by heading.
+    """
+    print_table(
+        list(columns),
+        [[shown(row[key], form) for key, form in columns.values()] for row in rows],
+    )
+
+
+def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool, digits: int = 4) -> None:
+    """Print rows with the same keys on stdout, as JSON or as a table.
+
+    In a table, None is shown as "-", and truth values as "yes" or "no". digits: number of
+    significant digits in a table.
+    """
     if as_json:
         print_json(rows)
     elif rows:
         columns = dict.fromkeys(name for row in rows for name in _flatten(row))
         table = [_flatten(row) for row in rows]
-        print_table(list(columns), [[_show(row.get(name)) for name in columns] for row in table])
+        cells = [[_show(row.get(name), digits) for name in columns] for row in table]
+        print_table(list(columns), cells)
 
 
 def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace nested mappings by their values, with joined names such as "interval_ms p50"."""
+    """Replace nested mappings by their values, with names such as "interval_ms p50"."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Mapping):
@@ -137,11 +158,13 @@ def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _show(value: Any) -> str:
+def _show(value: Any, digits: int) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.{digits}g}"
     if isinstance(value, list | tuple):
-        return ", ".join(map(_show, value))
+        return ", ".join(_show(one, digits) for one in value)
     return "-" if value is None else str(value)
 
 
@@ -166,6 +189,46 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
         print(f"{name:<{width}}  {value}".rstrip())
 
 
+SHOWN_UNITS = {"m": (1e3, "mm"), "m/N": (1e6, "µm/N"), "rad": (math.degrees(1.0), "°")}
+"""The factor and the unit of printed values, by SI unit; other units are not converted."""
+
+
+def print_result(result: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print a result on stdout, as JSON or as one line for each of its values.
+
+    In the lines, lengths are in mm, angles are in degrees, and missing values are omitted.
+    """
+    if as_json:
+        print_json(result)
+    else:
+        print_fields(_list_values(replace_non_finite(result)))
+
+
+def _list_values(
+    values: Mapping[str, Any], prefix: str = "", outer_unit: str = ""
+) -> Iterator[tuple[str, str]]:
+    """Yield label and text of all values.
+
+    The unit of a value is the suffix of its name, or `outer_unit` for a name without unit.
+    """
+    for name, value in values.items():
+        suffix = next((one for one in UNITS if name.endswith(one)), "")
+        si_unit = UNITS.get(suffix, outer_unit)
+        label = name if si_unit == "1" else name.removesuffix(suffix)
+        label = prefix + (label.replace("_", " ") if name.isidentifier() else label)
+        if isinstance(value, Mapping):
+            yield from _list_values(value, f"{label} ", si_unit)
+        elif value is not None:
+            factor, unit = SHOWN_UNITS.get(si_unit, (1.0, si_unit.removeprefix("1")))
+            yield label, f"{_show(_scale(value, factor), 5)} {unit}".rstrip()
+
+
+def _scale(value: Any, factor: float) -> Any:
+    if isinstance(value, list):
+        return [_scale(one, factor) for one in value]
+    return factor * value if isinstance(value, float) else value
+
+
 @contextmanager
 def progress_words() -> Iterator[Callable[[str], None]]:
     """Yield a function that shows a progress message with the elapsed time on stderr.
@@ -184,16 +247,16 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
-    """Show a progress bar on stderr, and yield its update function (done, total).
+def progress_bar(label: str) -> Iterator[Callable[..., None]]:
+    """Show a progress bar on stderr, and yield its update function (done, total, text).
 
-    If stderr is not a terminal, lines with the progress are printed: one for every 5 %, and at
-    most one in PROGRESS_LINE_S seconds.
+    The optional text replaces the label in a terminal. If stderr is not a terminal, lines with the
+    progress are printed: one for every 5 %, and at most one in PROGRESS_LINE_S seconds.
     """
     if not words.is_terminal:
         printed_s, printed = time.monotonic(), 0.0
 
-        def print_line(done: float, total: float) -> None:
+        def print_line(done: float, total: float, _: str = "") -> None:
             nonlocal printed_s, printed
             due = time.monotonic() - printed_s >= PROGRESS_LINE_S
             if due and total > 0.0 and done / total - printed >= 0.05:
@@ -219,14 +282,16 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
     )
     with Progress(*columns, console=words.console, transient=True) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        yield lambda done, total, text=label: bar.update(
+            task, completed=done, total=total, description=text
+        )
 
 
 def logs_on_stderr() -> None:
-    """Write log records of a command with level warning or higher to stderr.
+    """Write the warnings and errors in the log of a command to stderr.
 
-    By default they go to stdout, which is reserved for the results of the command. Call this
-    function before any logger is created.
+    By default, structlog writes to stdout, which is reserved for results. Call this function before
+    any logger is created.
     """
     import logging
 

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import closing
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import receive_until, run_interruptible, running_graph
+from flexsheet.launch.commands.graph import (
+    find_node,
+    receive_until,
+    run_interruptible,
+    running_graph,
+)
 from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
     examples,
     print_json,
+    print_outcome,
     print_rows,
-    words,
 )
 
 if TYPE_CHECKING:
@@ -49,18 +55,14 @@ ParameterArgument = Annotated[
 def list_parameters(
     node: Annotated[
         str | None,
-        typer.Argument(
-            metavar="NODE",
-            help="Name of a node; default: all nodes.",
-            autocompletion=complete.nodes,
-        ),
+        typer.Argument(help="Name of a node; default: all nodes.", autocompletion=complete.nodes),
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the parameters of the running graph, and state which can be changed while it runs."""
     plan, found = running_graph(run)
-    nodes = [_find_node(plan, node)] if node else list(plan.nodes.values())
+    nodes = [find_node(plan, node)] if node else list(plan.nodes.values())
     changed = _read_changes(plan, found, {one.name for one in nodes if _live(one)})
     rows = [
         {
@@ -72,9 +74,6 @@ def list_parameters(
         for name, value in one.parameters.items()
         if name != "apparatus"
     ]
-    if not as_json:
-        for row in rows:
-            row["live"] = "yes" if row["live"] else ""
     print_rows(rows, as_json=as_json)
 
 
@@ -101,7 +100,7 @@ def get_parameter(
 )
 def set_parameter(
     parameter: ParameterArgument,
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value, in YAML syntax.")],
+    value: Annotated[str, typer.Argument(help="New value, in YAML syntax.")],
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -135,25 +134,15 @@ def set_parameter(
         raise CommandError(f"{parameter}={value}: invalid value: {text}") from error
     new = checked.model_dump(mode="json")[name]
     run_interruptible(_set(plan, found, node.name, name, new))
-    if as_json:
-        print_json({"parameter": parameter, "value": new})
-    else:
-        words.print(f"{parameter} = {json.dumps(new)}")
-
-
-def _find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:
-    from flexsheet.launch.plans.documents import did_you_mean
-
-    if name not in plan.nodes:
-        raise CommandError(f'"{name}": unknown node; {did_you_mean(name, list(plan.nodes))}')
-    return plan.nodes[name]
+    result = {"parameter": parameter, "value": new}
+    print_outcome(result, f"{parameter} = {json.dumps(new)}", as_json=as_json)
 
 
 def _find_parameter(plan: ResolvedGraph, text: str) -> tuple[ResolvedNode, str]:
     from flexsheet.launch.plans.documents import did_you_mean
 
     node_name, _, name = text.partition(".")
-    node = _find_node(plan, node_name)
+    node = find_node(plan, node_name)
     if name not in node.parameters:
         raise CommandError(
             f'"{text}": unknown parameter; {did_you_mean(name, list(node.parameters))}'
@@ -168,10 +157,7 @@ def _live(node: ResolvedNode) -> frozenset[str]:
 
 
 def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters that have changed since the start of the graph.
-
-    The result contains a dictionary of values by parameter name for each of the nodes.
-    """
+    """Return the changed parameters of running nodes, by node and parameter name."""
     found: dict[str, dict[str, Any]] = {}
     if nodes:
         run_interruptible(_await_statuses(plan, run, lambda: nodes <= found.keys(), found))
@@ -181,9 +167,9 @@ def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, d
 async def _await_statuses(
     plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
 ) -> int:
-    """Store the changed parameters from node statuses in `found` until `done` returns True.
+    """Store the changed parameters by node and name until `done` returns True.
 
-    found: changed values by node and parameter name. Returns 0, or 1 on a timeout.
+    Returns 0, or 1 on a timeout.
     """
 
     def add(status: Status) -> None:
@@ -193,23 +179,18 @@ async def _await_statuses(
 
 
 async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) -> int:
-    """Publish a parameter change, wait until the node's status confirms it, and return the exit
-    code."""
+    """Publish a parameter change, and wait until the node's status confirms it; return 0."""
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
     from flexsheet.messages.types import ParameterChange
 
-    writer = GraphWriter(plan, run, ["parameter"])
-    try:
+    with closing(GraphWriter(plan, run, ["parameter"])) as writer:
         await asyncio.sleep(READER_RECONNECT_S)
         change = ParameterChange(node=node, parameter=name, value=json.dumps(value))
         writer.publish("parameter", change)
-
         found: dict[str, dict[str, Any]] = {}
         if await _await_statuses(plan, run, lambda: found.get(node, {}).get(name) == value, found):
             raise CommandError(
                 f"{node}.{name}: the node did not confirm the change; see flexsheet logs {node}",
                 FAILED,
             )
-    finally:
-        writer.close()
     return 0

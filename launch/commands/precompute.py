@@ -1,7 +1,4 @@
-"""`flexsheet precompute`: compute the tables of a scene and store them in a cache.
-
-A graph then reads the tables from the cache, and starts faster.
-"""
+"""`flexsheet precompute`: compute the tables of a scene, so that a graph starts faster."""
 
 from __future__ import annotations
 
@@ -32,9 +29,7 @@ def precompute(
     scene_file: SceneArgument,
     cache: Annotated[
         Path | None,
-        typer.Option(
-            "--cache", metavar="FOLDER", help="Cache folder; default: the cache of this user."
-        ),
+        typer.Option(metavar="FOLDER", help="Cache folder; default: the cache of this user."),
     ] = None,
     skin_spacing_m: Annotated[
         float | None,

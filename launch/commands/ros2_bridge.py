@@ -9,17 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
-from flexsheet.launch.commands.options import (
-    DurationOption,
-    JsonOption,
-    RunOption,
-    TopicsOption,
-    make_app,
-)
-from flexsheet.launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
+from flexsheet.launch.commands.output import CommandError, examples, print_json, words
 
-app = make_app()
+app = options.make_app()
 
 
 class ExternalTopic(StrEnum):
@@ -38,19 +32,17 @@ class ExternalTopic(StrEnum):
 )
 def ros2_bridge(
     *,
-    topics: TopicsOption = None,
+    topics: options.TopicsOption = None,
     accept: Annotated[
         list[ExternalTopic] | None,
         typer.Option(
-            "--accept",
             help="Topic that ROS nodes may publish, as /external/eye or /external/fingertip; can "
-            "be repeated; default: none.",
+            "be repeated; default: none."
         ),
     ] = None,
     noise_mm: Annotated[
         float,
         typer.Option(
-            "--noise-mm",
             metavar="MM",
             min=0.01,
             max=50.0,
@@ -59,9 +51,7 @@ def ros2_bridge(
     ] = 1.0,
     domain: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", min=0, max=232, help="DDS domain number; default: ROS_DOMAIN_ID or 0."
-        ),
+        typer.Option(min=0, max=232, help="DDS domain number; default: ROS_DOMAIN_ID or 0."),
     ] = None,
     interface: Annotated[
         str,
@@ -71,9 +61,9 @@ def ros2_bridge(
             "everyone in that network can read the topics and publish external inputs.",
         ),
     ] = "lo",
-    duration: DurationOption = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    duration: options.DurationOption = None,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Publish the topics of the running graph to ROS 2, and accept external inputs.
 
@@ -89,34 +79,31 @@ def ros2_bridge(
     for name in names:
         find_topic(name)
         if name not in plan.writers:
-            raise CommandError(
-                f"--topic {name}: the topic has no writer in the running graph", BAD_INPUT
-            )
+            raise CommandError(f"--topic {name}: the topic has no writer in the running graph")
     if domain is None:
         given = os.environ.get("ROS_DOMAIN_ID", "0")
         if not given.isdigit() or int(given) > MAX_DOMAIN:
             raise CommandError(
                 f"ROS_DOMAIN_ID={given}: expected a number from 0 to {MAX_DOMAIN}; correct it, or "
-                "give --domain",
-                BAD_INPUT,
+                "give --domain"
             )
         domain = int(given)
     participant = RosParticipant(domain, interface)
-    options = {
+    settings = {
         "topics": names,
         "accept": [one.value for one in accept or ()],
         "noise_m": noise_mm * 1e-3,
     }
-    words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop", markup=False)
+    words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop")
     counts: dict[str, Any] = {"published": {}, "accepted": {}, "rejected": {}}
-    work = _run(plan, found, participant, options=options, duration_s=duration, counts=counts)
+    work = _run(plan, found, participant, options=settings, duration_s=duration, counts=counts)
     run_interruptible(work)
     if as_json:
         print_json(counts)
         return
     for what, numbers in counts.items():
         listed = ", ".join(f"{number} {name}" for name, number in sorted(numbers.items()))
-        words.print(f"{what}: {listed or 'none'}", markup=False)
+        words.print(f"{what}: {listed or 'none'}")
 
 
 async def _run(
@@ -136,7 +123,7 @@ async def _run(
             run,
             participant,
             **options,
-            on_problem=lambda text: words.print(text, markup=False),
+            on_problem=words.print,
         )
     except BaseException:
         participant.close()

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, output_file
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, result_file
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
-    check_folder,
     examples,
     print_json,
     words,
@@ -21,19 +18,8 @@ from flexsheet.launch.commands.output import (
 app = make_app("Export the apparatus of a scene to other tools.")
 
 
-class ModelFormat(StrEnum):
-    """The file formats of an exported model of the apparatus."""
-
-    URDF = "urdf"
-    GLTF = "gltf"
-
-
-SUFFIXES = {
-    ".urdf": ModelFormat.URDF,
-    ".xml": ModelFormat.URDF,
-    ".gltf": ModelFormat.GLTF,
-    ".glb": ModelFormat.GLTF,
-}
+SUFFIXES = {".urdf": "urdf", ".xml": "urdf", ".gltf": "gltf", ".glb": "gltf"}
+"""The format of an exported model by the suffix of the file name."""
 
 
 @app.callback()
@@ -51,14 +37,14 @@ def scene() -> None:
 def export(
     scene: SceneArgument,
     form: Annotated[
-        ModelFormat | None,
+        Literal["urdf", "gltf"] | None,
         typer.Option(
             "--format", metavar="urdf|gltf", help="Format; default: that of the file name."
         ),
     ] = None,
     output: Annotated[
         Path | None,
-        output_file("File to write: .urdf, .gltf, or .glb (binary glTF); default: print the text."),
+        result_file("File to write: .urdf, .gltf, or .glb (binary glTF); default: print the text."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -73,23 +59,21 @@ def export(
     from flexsheet.launch.viewing.urdf import make_urdf
     from flexsheet.messages.files import write_file
 
+    found: str = form or "urdf"
     if output is not None:
-        check_folder("--output", output)
         if output.suffix not in SUFFIXES:
             raise CommandError(
-                f"--output {output}: unknown file type; name a .urdf, .gltf or .glb file",
-                BAD_INPUT,
+                f"--output {output}: unknown file type; name a .urdf, .gltf or .glb file"
             )
-    found = form or (ModelFormat.URDF if output is None else SUFFIXES[output.suffix])
-    if output is not None and SUFFIXES[output.suffix] is not found:
-        raise CommandError(
-            f"--format {found}: {output} has the suffix of another format; change one of them",
-            BAD_INPUT,
-        )
+        found = form or SUFFIXES[output.suffix]
+        if SUFFIXES[output.suffix] != found:
+            raise CommandError(
+                f"--format {found}: {output} has the suffix of another format; change one of them"
+            )
     loaded = load_scene(scene)
     model = make_model(loaded)
     content: str | bytes
-    if found is ModelFormat.URDF:
+    if found == "urdf":
         content = make_urdf(model)
     elif output is not None and output.suffix == ".glb":
         content = make_glb(model, solve_rest_joints(loaded))
@@ -97,16 +81,15 @@ def export(
         content = make_gltf(model, solve_rest_joints(loaded))
     if output is not None:
         write_file(output, content)
-        words.print(f"wrote {output}", markup=False)
+        words.print(f"wrote {output}")
     if as_json:
-        moving = [joint.name for joint in model.joints if joint.limit is not None]
         print_json(
             {
                 "scene": loaded.name,
-                "format": str(found),
+                "format": found,
                 "output": None if output is None else str(output),
                 "links": [link.name for link in model.links],
-                "joints": moving,
+                "joints": [joint.name for joint in model.joints if joint.limit is not None],
             }
         )
     elif output is None:

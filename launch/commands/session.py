@@ -13,24 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
+from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.graph import (
     NoGraphError,
+    find_node,
     receive_until,
     run_interruptible,
+    run_node_here,
     running_graph,
 )
 from flexsheet.launch.commands.launching import format_log_line, run_graph
-from flexsheet.launch.commands.options import (
-    DurationOption,
-    JsonOption,
-    OtherSceneOption,
-    RunOption,
-    SettingsOption,
-    find_launch_file,
-    make_app,
-    with_scene,
-)
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
@@ -45,7 +37,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.messages.types import HostStatus, Status
 
-status_app, logs_app, stop_app, run_app = (make_app() for _ in range(4))
+status_app, logs_app, stop_app, run_app = (options.make_app() for _ in range(4))
 
 STATUS_TIMEOUT_S = 3.0
 """The maximum time to wait for the statuses of all nodes, in seconds.
@@ -63,14 +55,14 @@ NodeArgument = Annotated[
 
 
 @status_app.command(epilog=examples("flexsheet status", "flexsheet status --json"))
-def status(run: RunOption = None, as_json: JsonOption = False) -> None:
+def status(run: options.RunOption = None, as_json: options.JsonOption = False) -> None:
     """Show the nodes of the running graph with their message rates, lost messages and notes.
 
-    A node that reads more slowly than another one writes skips older messages of most topics. These
-    messages are counted as skipped. Lost messages were lost in transit or refused.
+    Skipped messages are older messages that a slow node does not read. Lost messages were lost in
+    transit or refused.
 
     The command also prints the problems that the self-checks of the nodes suspect. The exit code is
-    1 if there is such a problem, or if a node does not report its status.
+    1 if a problem is suspected, or if a node does not report its status.
     """
     plan, found = running_graph(run)
     statuses: dict[str, Status] = {}
@@ -113,9 +105,9 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
 async def _collect_statuses(
     plan: ResolvedGraph, run: Run, statuses: dict[str, Status], hosts: dict[str, HostStatus]
 ) -> int:
-    """Collect the statuses of all nodes and hosts for at most STATUS_TIMEOUT_S.
+    """Store the statuses of all nodes and hosts by name; return the exit code 0.
 
-    The function adds them to `statuses` and `hosts`. Returns the exit code.
+    The function waits for at most STATUS_TIMEOUT_S.
     """
     handlers: dict[str, Callable[[Any], None]] = {
         "status": lambda message: statuses.update({message.node: message}),
@@ -130,19 +122,14 @@ async def _collect_statuses(
 
 
 def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
-    """Return a table row with the status of a node; its values are None if the node does not
-    report."""
-    row: dict[str, Any] = {"node": node.name, "host": node.host, "state": "silent"}
+    """Return a table row with the status of a node, or with None if its status is unknown."""
+    row: dict[str, Any] = {"node": node.name, "host": node.host}
     if status is None:
-        none: dict[str, Any] = {
-            "cpu": None,
-            "memory_mb": None,
-            "skipped": None,
-            "lost": None,
-            "inputs": [],
-            "outputs": [],
-        }
-        return row | none | {"errors": None, "note": ""}
+        unknown = dict.fromkeys(("cpu", "memory_mb", "skipped", "lost"))
+        return {
+            **row, "state": "silent", **unknown,
+            "inputs": [], "outputs": [], "errors": None, "note": "",
+        }  # fmt: skip
     return row | {
         "state": status.state,
         "cpu": round(status.cpu_ratio, 3),
@@ -157,7 +144,7 @@ def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
 
 
 def describe_output(port: dict[str, Any]) -> str:
-    """Return the topic of an output port, followed by its rate if the topic is periodic.
+    """Return the topic of an output port and, for a periodic topic, its rate.
 
     port: statistics of the port in a node's status.
     """
@@ -190,14 +177,13 @@ def _list_suspicions(statuses: dict[str, Status]) -> list[dict[str, Any]]:
 def logs(
     node: NodeArgument,
     lines: Annotated[
-        int | None,
-        typer.Option("-n", "--lines", metavar="N", min=0, help="Print the last N lines only."),
+        int | None, typer.Option("-n", "--lines", min=0, help="Print the last N lines only.")
     ] = None,
     follow: Annotated[
         bool, typer.Option("-f", "--follow", help="Continue to print new lines until Ctrl-C.")
     ] = False,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Print the log of a node of the running graph, or of the newest run if none is running."""
     from flexsheet.launch.plans.documents import did_you_mean
@@ -224,8 +210,8 @@ def logs(
 def _newest_run(directory: Path | None) -> Run:
     """Return the run in a directory.
 
-    If `directory` is None, return the newest running graph, or the newest run if no graph is
-    running.
+    If `directory` is None, return the newest running graph. If no graph is running, return the
+    newest run.
     """
     from flexsheet.launch.running.runs import Run, list_live_runs, list_runs
 
@@ -255,11 +241,11 @@ def _further_lines(text: Any, run: Run) -> Iterator[str]:
 
 @stop_app.command(epilog=examples("flexsheet stop", "flexsheet stop --all"))
 def stop(
-    run: RunOption = None,
+    run: options.RunOption = None,
     stop_all: Annotated[
         bool, typer.Option("--all", help="Stop all graphs of this user on this computer.")
     ] = False,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Stop the running graph in the same way as Ctrl-C in its terminal.
 
@@ -300,17 +286,15 @@ def run_node(
         Path | None,
         typer.Option(
             "--launch",
-            metavar="LAUNCH_FILE",
             help="Launch file of a graph that is not running; only this node is started.",
-            autocompletion=complete.launch_files,
-            callback=find_launch_file,
+            **options.LAUNCH_FILE,
         ),
     ] = None,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    duration: DurationOption = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    duration: options.DurationOption = None,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Run one node of a launch file in this terminal until Ctrl-C.
 
@@ -318,10 +302,9 @@ def run_node(
     launch LAUNCH_FILE --without NODE`. With --launch, the command instead starts a new graph that
     contains only this node.
     """
-    from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan import load_graph
 
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     if launch_file is not None:
         plan = load_graph(launch_file, settings=given)
     else:
@@ -331,10 +314,7 @@ def run_node(
                 "--set and --scene require --launch LAUNCH_FILE, because the running graph has "
                 "fixed settings"
             )
-    if node not in plan.nodes:
-        raise CommandError(
-            f'"{node}": unknown node of {plan.launch_file}; {did_you_mean(node, list(plan.nodes))}'
-        )
+    find_node(plan, node)
     if launch_file is not None:
         without = [name for name in plan.nodes if name != node]
         code = asyncio.run(run_graph(plan, None, duration, without=without))
@@ -347,7 +327,6 @@ def run_node(
 
 async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | None) -> int:
     from flexsheet.launch.running.supervisor import node_config
-    from flexsheet.nodes.runner import run_node as run_config
 
     if (run.directory / f"{name}.status").exists():
         raise CommandError(
@@ -356,11 +335,5 @@ async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | No
             FAILED,
         )
     words.print(f"running {name} in {run.directory}; press Ctrl-C to stop")
-    stop_event = asyncio.Event()
-    work = asyncio.create_task(run_config(node_config(plan, plan.nodes[name], run), stop_event))
-    try:
-        await asyncio.wait((work,), timeout=duration_s)
-    finally:
-        stop_event.set()
-        await work
+    await run_node_here(node_config(plan, plan.nodes[name], run), duration_s)
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +13,6 @@ from flexsheet.launch.commands.output import FAILED, CommandError, examples, pri
 from flexsheet.messages.files import write_file
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
-
-USER_PATTERN = "abcdefghijklmnopqrstuvwxyz0123456789_-"
 
 
 @app.callback()
@@ -56,7 +55,7 @@ def install(
         raise CommandError(
             f'--host "{host}": unknown host; {launch_file} defines {", ".join(plan.hosts)}'
         )
-    if not user or set(user) - set(USER_PATTERN):
+    if not re.fullmatch(r"[a-z0-9_-]+", user):
         raise CommandError(
             f'--user "{user}": invalid user name; use lower-case letters, digits, _ and -'
         )
@@ -86,6 +85,5 @@ def install(
     if not dry_run:
         words.print(
             f"next: sysctl -e -p /etc/sysctl.d/90-flexsheet.conf && systemctl daemon-reload && "
-            f"systemctl enable --now flexsheet@{host}; "
-            f"log: journalctl -fu flexsheet@{host}"
+            f"systemctl enable --now flexsheet@{host}; log: journalctl -fu flexsheet@{host}"
         )

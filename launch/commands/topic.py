@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.graph import (
+    list_readers,
+    receiving,
+    run_interruptible,
+    running_graph,
+)
 from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument, make_app
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -19,6 +25,7 @@ from flexsheet.launch.commands.output import (
     print_fields,
     print_json,
     print_json_line,
+    print_outcome,
     print_rows,
     print_table,
     words,
@@ -61,23 +68,21 @@ def list_topics(as_json: JsonOption = False) -> None:
     from flexsheet.messages.topics import TOPICS
 
     rows = [_describe(topic) for topic in TOPICS.values()]
-    if as_json:
-        print_json(rows)
-        return
-    for row in rows:
-        rate = row["expected_rate_hz"]
-        row["expected_rate_hz"] = "on change" if rate is None else "{:g}-{:g}".format(*rate)
-        row["logged"] = "yes" if row["logged"] else ""
-    names = ("topic", "message", "delivery", "expected_rate_hz", "logged", "about")
-    print_rows([{name: row[name] for name in names} for row in rows], as_json=False)
+    if not as_json:
+        for row in rows:
+            rate = row["expected_rate_hz"]
+            row["expected_rate_hz"] = "on change" if rate is None else "{:g}-{:g}".format(*rate)
+            del row["many_writers"], row["max_bytes"]
+    print_rows(rows, as_json=as_json)
 
 
 @app.command(epilog=examples("flexsheet topic info fingertip"))
 def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = False) -> None:
     """Print the type and fields of a topic, and its writers and readers in the running graph."""
     from flexsheet.messages.field_types import describe_field
+    from flexsheet.messages.topics import find_topic
 
-    found = _find_topic(topic)
+    found = find_topic(topic)
     description = _describe(found)
     description["fields"] = {
         name: describe_field(field) for name, field in found.message.model_fields.items()
@@ -89,11 +94,7 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
             raise
     else:
         description["writers"] = [writer.name for writer in plan.writers.get(topic, ())]
-        description["readers"] = [
-            node.name
-            for node in plan.nodes.values()
-            if any(port.topic == topic for port in node.inputs)
-        ]
+        description["readers"] = list_readers(plan, topic)
     if as_json:
         print_json(description)
         return
@@ -144,10 +145,9 @@ def echo(
 
     With --json, each message is a JSON document on its own line.
     """
-    found = _find_topic(topic)
-    limit = 1 if once else count
-
     from dataclasses import asdict
+
+    from flexsheet.messages.topics import find_topic
 
     def show(message: Message, header: Header) -> None:
         value = _get_field(message, field, topic)
@@ -158,7 +158,8 @@ def echo(
         print(f"--- {header.writer} #{header.sequence}, source {seconds} s")
         print("\n".join(_format_lines(to_plain(value, full=full))), flush=True)
 
-    raise typer.Exit(run_interruptible(_read(found, run, show, limit, timeout)))
+    limit = 1 if once else count
+    raise typer.Exit(run_interruptible(_read(find_topic(topic), run, show, limit, timeout)))
 
 
 @app.command(epilog=examples("flexsheet topic hz stereo --duration 10"))
@@ -169,8 +170,7 @@ def hz(
     as_json: JsonOption = False,
 ) -> None:
     """Measure the message rate of each writer of a topic, from timestamps and sequence numbers."""
-    arrivals = _measure(topic, run, duration)
-    print_rows(measure_rates([one.header for one in arrivals]), as_json=as_json)
+    print_rows(measure_rates(_measure(topic, run, duration)), as_json=as_json)
 
 
 @app.command(epilog=examples("flexsheet topic bw stereo", "flexsheet topic bw frame --json"))
@@ -193,9 +193,8 @@ def delay(
 ) -> None:
     """Measure the age of a topic's data when a message arrives at this command.
 
-    The age is the time since the source timestamp, for instance since the exposure of an image. The
-    command ignores messages with timestamps of another computer, because it does not know the
-    difference of the clocks.
+    The age is the time since the source timestamp, for instance since the exposure of an image.
+    Messages with timestamps of another computer are ignored, because its clock may differ.
     """
     from flexsheet.messages.clock import SystemClock
 
@@ -241,7 +240,9 @@ def pub(
     Subscribers that connect later receive a message of a latched topic only while this command
     runs.
     """
-    found = _find_topic(topic)
+    from flexsheet.messages.topics import find_topic
+
+    found = find_topic(topic)
     built = _parse_message(found, message)
     times = 1 if once or (rate is None and count is None) else count
     sent = 0
@@ -253,10 +254,7 @@ def pub(
     code = run_interruptible(
         _publish(found, built, run=run, rate_hz=rate or 1.0, times=times, on_sent=on_sent)
     )
-    if as_json:
-        print_json({"topic": topic, "sent": sent})
-    else:
-        words.print(f'sent {sent} on "{topic}"')
+    print_outcome({"topic": topic, "sent": sent}, f'sent {sent} on "{topic}"', as_json=as_json)
     raise typer.Exit(code)
 
 
@@ -280,35 +278,31 @@ class Arrival:
     received_ns: int
 
 
-def _by_writer(arrivals: Sequence[Any], header: Callable[[Any], Header]) -> list[list[Any]]:
-    """Group messages by writer and by start of the writer.
+def _by_writer(arrivals: Sequence[Arrival]) -> list[list[Arrival]]:
+    """Group messages by writer.
 
-    A writer that restarts begins a new group, because its sequence numbers restart. header:
-    function that returns the header of a message.
+    A writer that restarts begins a new group, because its sequence numbers restart.
     """
-    groups: dict[tuple[str, int], list[Any]] = {}
+    groups: dict[tuple[str, int], list[Arrival]] = {}
     for one in arrivals:
-        groups.setdefault((header(one).writer, header(one).epoch), []).append(one)
+        groups.setdefault((one.header.writer, one.header.epoch), []).append(one)
     return list(groups.values())
 
 
-def measure_rates(headers: Sequence[Header]) -> list[dict[str, Any]]:
-    """Return the message rate, lost messages and publication intervals (ms) of all writers.
-
-    The result has one row per writer.
-    """
+def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
+    """Return the rate, the lost messages and the publication intervals (ms), one row per writer."""
     import numpy as np
 
     rows = []
-    for own in _by_writer(headers, lambda header: header):
-        sequences = np.array([header.sequence for header in own])
-        stamps_s = np.array([header.publish_ns for header in own]) * 1e-9
+    for own in _by_writer(arrivals):
+        sequences = np.array([one.header.sequence for one in own])
+        stamps_s = np.array([one.header.publish_ns for one in own]) * 1e-9
         span_s = float(stamps_s[-1] - stamps_s[0])
         sent = int(sequences[-1] - sequences[0])
         steps_ms = np.diff(stamps_s)[np.diff(sequences) == 1] * 1e3
         rows.append(
             {
-                "writer": own[0].writer,
+                "writer": own[0].header.writer,
                 "rate_hz": sent / span_s if span_s > 0 else None,
                 "received": len(own),
                 "lost": int(sent + 1 - len(own)),
@@ -319,10 +313,9 @@ def measure_rates(headers: Sequence[Header]) -> list[dict[str, Any]]:
 
 
 def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the bandwidth (bytes per second) and the message sizes of all writers, one row
-    each."""
+    """Return the bandwidth (bytes per second) and the message sizes, one row per writer."""
     rows = []
-    for own in _by_writer(arrivals, lambda one: one.header):
+    for own in _by_writer(arrivals):
         sizes = [one.size_bytes for one in own]
         span_s = (own[-1].received_ns - own[0].received_ns) * 1e-9
         rows.append(
@@ -341,15 +334,10 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
     """Return statistics of the age (ms) of the data at arrival, one row per writer."""
     rows = []
-    for own in _by_writer(arrivals, lambda one: one.header):
+    for own in _by_writer(arrivals):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
-        rows.append(
-            {
-                "writer": own[0].header.writer,
-                "messages": len(own),
-                "age_ms": _summarize(ages_ms),
-            }
-        )
+        writer = own[0].header.writer
+        rows.append({"writer": writer, "messages": len(own), "age_ms": _summarize(ages_ms)})
     return rows
 
 
@@ -412,12 +400,6 @@ def _format_value(value: Any) -> str:
     return str(value)
 
 
-def _find_topic(name: str) -> Topic:
-    from flexsheet.messages.topics import find_topic
-
-    return find_topic(name)
-
-
 def _describe(topic: Topic) -> dict[str, Any]:
     return {
         "topic": topic.name,
@@ -463,20 +445,19 @@ async def _read(
         topic, run, lambda message, header: arrived.put_nowait((message, header))
     )
     waiting = asyncio.get_running_loop().call_later(REPORT_DELAY_S, _report_no_message, topic)
-    subscriber.start()
-    try:
-        shown = 0
-        while limit is None or shown < limit:
-            async with asyncio.timeout(timeout_s):
-                message, header = await arrived.get()
+    with receiving([subscriber]):
+        try:
+            shown = 0
+            while limit is None or shown < limit:
+                async with asyncio.timeout(timeout_s):
+                    message, header = await arrived.get()
+                waiting.cancel()
+                show(message, header)
+                shown += 1
+        except TimeoutError:
+            raise make_silence_error(topic.name, timeout_s or 0.0) from None
+        finally:
             waiting.cancel()
-            show(message, header)
-            shown += 1
-    except TimeoutError:
-        raise make_silence_error(topic.name, timeout_s or 0.0) from None
-    finally:
-        waiting.cancel()
-        subscriber.close()
     return 0
 
 
@@ -485,8 +466,10 @@ def _measure(topic: str, run: Path | None, duration_s: float) -> list[Arrival]:
 
     Raises CommandError if no message arrives.
     """
+    from flexsheet.messages.topics import find_topic
+
     arrivals: list[Arrival] = []
-    run_interruptible(_collect(_find_topic(topic), run, arrivals, duration_s))
+    run_interruptible(_collect(find_topic(topic), run, arrivals, duration_s))
     if not arrivals:
         raise make_silence_error(topic, duration_s)
     return arrivals
@@ -503,12 +486,8 @@ async def _collect(
         size_bytes = sum(memoryview(frame).nbytes for frame in frames)
         arrivals.append(Arrival(header, size_bytes, clock.now_ns()))
 
-    subscriber = make_listener(topic, run, receive, raw=True)
-    subscriber.start()
-    try:
+    with receiving([make_listener(topic, run, receive, raw=True)]):
         await asyncio.sleep(duration_s)
-    finally:
-        subscriber.close()
     return 0
 
 
@@ -517,8 +496,7 @@ def make_listener(
 ) -> Subscriber:
     """Create a subscriber to a topic of the running graph.
 
-    raw: pass undecoded messages to the handler. Raises CommandError if no node of the graph
-    publishes the topic.
+    raw: pass encoded messages to the handler. Raises CommandError if no node publishes the topic.
     """
     from flexsheet.launch.running.tools import make_subscriber
 
@@ -529,14 +507,7 @@ def make_listener(
             "add a node that publishes it to the launch file",
             FAILED,
         )
-    return make_subscriber(
-        topic.name,
-        plan,
-        run,
-        handler,
-        on_problem=words.print,
-        raw=raw,
-    )
+    return make_subscriber(topic.name, plan, run, handler, on_problem=words.print, raw=raw)
 
 
 def _parse_message(topic: Topic, text: str) -> Message:
@@ -579,8 +550,7 @@ async def _publish(
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
     plan, found = running_graph(run)
-    writer = GraphWriter(plan, found, [topic.name])
-    try:
+    with closing(GraphWriter(plan, found, [topic.name])) as writer:
         await asyncio.sleep(READER_RECONNECT_S)
         sent = 0
         while times is None or sent < times:
@@ -592,6 +562,4 @@ async def _publish(
         # Wait for readers that are still connecting, because the latched message is lost with the
         # publisher's socket.
         await asyncio.sleep(READER_RECONNECT_S / 2)
-    finally:
-        writer.close()
     return 0

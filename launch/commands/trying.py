@@ -9,25 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.launching import describe_run, page_url, run_graph, start_loop_check
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    DurationOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    SettingsOption,
-    make_app,
-    with_scene,
-)
 from flexsheet.launch.commands.output import examples, print_json_line, progress_words, words
 from flexsheet.nodes.signals import keyboard_interrupts
 
 if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
 
-app = make_app()
+app = options.make_app()
 
 
 @app.command(
@@ -37,16 +27,16 @@ app = make_app()
 )
 def try_it(
     *,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
     port: Annotated[
         int, typer.Option(help="TCP port of the console page.", min=1, max=65535)
     ] = 8080,
     browser: Annotated[bool, typer.Option(help="Open the console page in the browser.")] = True,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
-    duration: DurationOption = None,
-    as_json: JsonOption = False,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    duration: options.DurationOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate the display, and touch a virtual object with the mouse in a web browser.
 
@@ -60,7 +50,7 @@ def try_it(
     page = [f"console.page_port={port}"]
     plan = load_graph(
         launch_file,
-        settings=[*page, *with_scene(settings, scene)],
+        settings=[*page, *options.with_scene(settings, scene)],
         console=True,
         apparatus=apparatus,
     )

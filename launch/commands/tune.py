@@ -43,7 +43,6 @@ def tune(
     family: Annotated[
         list[str] | None,
         typer.Option(
-            "--family",
             metavar="NAME",
             help="Method family to tune; repeat the option for several; default: all.",
             autocompletion=complete.tuned_families,
@@ -64,7 +63,6 @@ def tune(
     runs: Annotated[
         int,
         typer.Option(
-            "--runs",
             min=0,
             max=100,
             help="Number of simulated strokes per configuration that is tested in the graph; 0: "
@@ -83,11 +81,11 @@ def tune(
 ) -> None:
     """Choose the fastest methods that meet the tolerances of a scene, and write them to the scene.
 
-    The command measures each method family on this computer over the working range of the scene,
-    which takes seconds to minutes. It then predicts the errors of combined methods, and tests the
-    fastest promising configuration in a graph. It accepts a configuration that meets all
-    tolerances, including those of latency and force. With --family, it chooses only the methods of
-    these method families, each separately. Nodes use the chosen method if their parameter is
+    The command measures each method family on this computer over the working range of the scene.
+    This takes seconds to minutes. Then the command predicts the errors of combined methods, and
+    tests the fastest promising configuration in a graph. An accepted configuration meets all
+    tolerances, including those of latency and force. With --family, the command chooses only the
+    methods of these families, each separately. Nodes use the chosen method if their parameter is
     `auto`. The exit code is 3 if a tolerance is not met.
     """
     logs_on_stderr()

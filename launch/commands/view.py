@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import os
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,8 +16,7 @@ from flexsheet.launch.commands.options import DurationOption, JsonOption, RunOpt
 from flexsheet.launch.commands.output import CommandError, examples, print_json_line, words
 
 if TYPE_CHECKING:
-    from flexsheet.launch.plans.plan_model import ResolvedGraph
-    from flexsheet.launch.running.runs import Run
+    from flexsheet.launch.viewing.live_server import LiveServer
 
 app = make_app()
 
@@ -36,8 +37,7 @@ def view(
         typer.Option(metavar="HZ", help="Maximum rate of numeric values per channel, Hz.", min=0.1),
     ] = 30.0,
     image_rate: Annotated[
-        float,
-        typer.Option(metavar="HZ", help="Maximum rate of images and meshes, Hz.", min=0.1),
+        float, typer.Option(metavar="HZ", help="Maximum rate of images and meshes, Hz.", min=0.1)
     ] = 10.0,
     run: RunOption = None,
     duration: DurationOption = None,
@@ -58,37 +58,28 @@ def view(
         ) from error
     plan, found = running_graph(run)
     os.nice(NICENESS)
-    serving = _serve(
+    from flexsheet.launch.viewing.live_server import LiveServer
+
+    make_server = partial(
+        LiveServer,
         plan,
         found,
         port=port,
-        rates_hz=(rate, image_rate),
-        duration_s=duration,
-        as_json=as_json,
+        rate_hz=rate,
+        image_rate_hz=image_rate,
+        on_problem=words.print,
     )
-    raise typer.Exit(run_interruptible(serving))
+    raise typer.Exit(run_interruptible(_serve(make_server, port, duration, as_json)))
 
 
 async def _serve(
-    plan: ResolvedGraph,
-    run: Run,
-    *,
-    port: int,
-    rates_hz: tuple[float, float],
-    duration_s: float | None,
-    as_json: bool,
+    make_server: Callable[[], LiveServer], port: int, duration_s: float | None, as_json: bool
 ) -> int:
-    from flexsheet.launch.viewing.live_server import ADDRESS, LiveServer
+    """Serve viewers for a limited or unlimited time, and return the exit code 0."""
+    from flexsheet.launch.viewing.live_server import ADDRESS
 
     try:
-        server = LiveServer(
-            plan,
-            run,
-            port=port,
-            rate_hz=rates_hz[0],
-            image_rate_hz=rates_hz[1],
-            on_problem=lambda text: words.print(text, markup=False),
-        )
+        server = make_server()
     except (OSError, RuntimeError) as error:
         raise CommandError(
             f"--port {port}: the server cannot listen there: {error}; choose another port"
@@ -99,8 +90,8 @@ async def _serve(
         if as_json:
             names = [channel.name for channel in server.channels]
             print_json_line({"address": address, "layout": str(layout), "channels": names})
-        words.print(f"connect Foxglove or Lichtblick to {address}", markup=False)
-        words.print(f"layout: {layout}", markup=False)
+        words.print(f"connect Foxglove or Lichtblick to {address}")
+        words.print(f"layout: {layout}")
         async with asyncio.timeout(duration_s):
             await server.serve()
     except TimeoutError:

@@ -211,9 +211,9 @@ def make_image_procedure(
         for value in values:
             await driver.follow(series.path(scene, value))
             await driver.wait_settled()
+            progress(f"taking images of the sheet {series.name.format(value)}")
             for correction in corrections:
                 label = series.label(value, correction)
-                progress(f"taking the image {label}")
                 await driver.capture_image(label, correction, shading)
                 for pattern in image.RAMPS if with_maps else ():
                     ramp_label = image.make_pattern_label(label, pattern)

@@ -1,8 +1,7 @@
 """Bridge a running graph to ROS 2: publish its topics over DDS, and accept external inputs.
 
-The bridge has the permissions of a command-line tool. It can read all topics of the graph, and can
-write only those that tools may write. External messages are published with the writer name of
-tools, so that readers and bags can recognize them.
+The bridge has the permissions of a command-line tool: to read all topics of the graph, and to write
+those that tools may write. External messages have the writer name of tools.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ from flexsheet.messages.topics import TOPICS, find_topic
 class Ros2Bridge:
     """A bridge between one running graph and one participant of the middleware DDS.
 
-    topics: flexsheet topics to publish. accept: topics to accept from ROS nodes, which are keys of
-    `INPUTS`. noise_m: standard deviation of external fingertip positions. published, accepted:
-    numbers of messages by topic. on_problem: function that is called with the text of an error.
+    topics: flexsheet topics to publish. accept: topics to accept from ROS nodes (keys of `INPUTS`).
+    noise_m: standard deviation of external fingertip positions. published, accepted: numbers of
+    messages by topic. on_problem: function that is called with the text of an error.
     """
 
     def __init__(
@@ -117,5 +116,5 @@ class Ros2Bridge:
 
 
 def list_default_topics(plan: ResolvedGraph) -> list[str]:
-    """Return the topics that are published by default, which are the topics that bags contain."""
+    """Return the topics that are published by default: all topics that bags contain."""
     return [name for name in plan.writers if find_topic(name).logged]

@@ -76,8 +76,7 @@ class Sample:
 
 @cache
 def make_dds_type(ros_type: str) -> Any:
-    """Make a Cyclone DDS type for a ROS type; its samples contain the CDR bytes in the field
-    `cdr`."""
+    """Make a Cyclone DDS type for a ROS type, whose samples contain CDR bytes in `cdr`."""
     described = _describe(ros_type)
 
     def serialize(self: Any, **_: Any) -> bytes:
@@ -118,10 +117,8 @@ def _describe(ros_type: str) -> Any:
 class RosParticipant:
     """A participant of a DDS domain that publishes and subscribes to ROS topics.
 
-    domain: number of the domain, which must equal the ROS_DOMAIN_ID of the other participants.
-    interface: name of the network interface to use.
-
-    Raises Ros2Error if the participant cannot be created.
+    domain: number of the domain, equal to the ROS_DOMAIN_ID of the other participants. interface:
+    name of the network interface. Raises Ros2Error if the participant cannot be created.
     """
 
     def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
@@ -154,11 +151,7 @@ class RosParticipant:
             )
 
     def has_readers(self, topic: RosTopic) -> bool:
-        """Return whether messages of a topic must be published.
-
-        This is the case if the topic has readers, or if it is latched, so that later readers
-        receive its last message.
-        """
+        """Return whether a topic has readers or is latched, so that it must be published."""
         return topic.latched or bool(self._writers[topic.name].get_matched_subscriptions())
 
     def write(self, topic: RosTopic, cdr: bytes) -> None:
@@ -226,9 +219,8 @@ class RosParticipant:
 def _make_qos(topic: RosTopic) -> Any:
     """Return the DDS quality of service: reliable, and transient local for a latched topic.
 
-    A ROS 2 reader may request reliable or best-effort delivery; a reliable writer serves both. The
-    quality of service contains the hash of the type, so that ROS 2 Iron and later releases list the
-    topic without a warning.
+    A reliable writer is compatible with reliable and with best-effort readers. Without the hash of
+    the type, ROS 2 Iron and later releases would print a warning.
     """
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration

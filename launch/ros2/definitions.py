@@ -1,7 +1,6 @@
-"""Generate the ROS 2 package `flexsheet_msgs`, whose message types equal those of flexsheet.
+"""Generate ROS 2 message types, in the package `flexsheet_msgs`, from those of flexsheet.
 
-A message type or a named group of fields becomes a ROS type of the same name. Fields are converted
-as follows:
+A message type or a group of fields becomes a ROS type of the same name. Fields become:
 
     bool, int, float, text              bool, int64, float64, string
     timestamp                           builtin_interfaces/Time
@@ -38,13 +37,12 @@ HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
 ELEMENTS = {"<f8": "float64", "<f4": "float32", "<i4": "int32", "<i8": "int64", "|u1": "uint8"}
 """The ROS element types of array fields, by NumPy element type."""
 
-Make = Callable[[str, dict[str, Any]], Any]
-"""The type of a function that makes a ROS message from the name of its type and its fields."""
+Make = Callable[..., Any]
+"""The type of a function that makes a ROS message from its type name and its fields (keywords)."""
 
 
 class Ros2Error(FlexsheetError, RuntimeError):
-    """Raised if messages cannot be exchanged with ROS 2; the text states the reason and the
-    remedy."""
+    """Raised if messages cannot be exchanged with ROS 2."""
 
     code = "ros2"
     remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
@@ -52,7 +50,7 @@ class Ros2Error(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class OwnField:
-    """A field of a generated ROS type: name, ROS type, and function that converts its values."""
+    """A field of a generated ROS type, with a function that converts its values."""
 
     name: str
     ros_type: str
@@ -119,7 +117,7 @@ def convert_fields(value: BaseModel, make: Make) -> dict[str, Any]:
 
 
 def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
-    """Return the groups of fields to which the ROS type of a message or group refers by name."""
+    """Return the groups of fields that the ROS type of a message or group contains."""
     named = {one.ros_type.partition("[")[0] for one in list_fields(kind)}
     groups: list[type[BaseModel]] = []
 
@@ -217,8 +215,8 @@ def _plain(value: Any, _: Make) -> Any:
 
 
 def _convert_group(value: BaseModel, make: Make) -> Any:
-    return make(ros_name(type(value)), convert_fields(value, make))
+    return make(ros_name(type(value)), **convert_fields(value, make))
 
 
 def _convert_stamp(value: int, make: Make) -> Any:
-    return make("builtin_interfaces/msg/Time", split_time(value))
+    return make("builtin_interfaces/msg/Time", **split_time(value))

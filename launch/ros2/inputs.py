@@ -1,8 +1,7 @@
 """Check messages of external ROS nodes, and convert them to messages of flexsheet.
 
-The messages are not trusted: a message is rejected unless its frame, numbers and timestamp are
-plausible. External fingertips are filtered by the same tracker as those from the camera. No
-external message commands the arms directly.
+A message is rejected if its frame, numbers or timestamp are not plausible. External fingertips are
+filtered by the same tracker as those from the camera. External messages cannot command the arms.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class ExternalInputs:
     def convert(
         self, topic: str, decode: Callable[[], Any], now_ns: int, unix_ns: int
     ) -> tuple[Message, int] | None:
-        """Convert a ROS message, and return it with its source timestamp (ns) on the local clock.
+        """Return a converted ROS message and its source timestamp (ns) on the local clock.
 
         decode: function that returns the ROS message, or raises an exception for malformed bytes.
         now_ns: current time of the local clock. unix_ns: current time since 1970, ns. Returns None
@@ -100,8 +99,7 @@ class ExternalInputs:
         return made, at_ns
 
     def _check_header(self, topic: str, header: Any, now_ns: int, unix_ns: int) -> int:
-        """Check the frame and timestamp of a header, and return the timestamp (ns) on the local
-        clock.
+        """Return the timestamp (ns) of a header on the local clock.
 
         Raises RejectedError if the frame or the timestamp is invalid.
         """

@@ -1,8 +1,7 @@
 """Map topics of flexsheet to topics of ROS 2, for exported bags and for the live bridge.
 
-`VIEWS` lists the ROS topics with standard types, and `inputs.INPUTS` lists the topics that a ROS
-node may publish for flexsheet. In addition, each topic is published with all its fields as
-`flexsheet/TOPIC`. The module `definitions` generates the types of these topics.
+`VIEWS` lists the ROS topics with standard types. In addition, each topic is published with all
+fields except images as `flexsheet/TOPIC`, with a type that the module `definitions` generates.
 
 Children of the frame `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`,
 `right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`. The measured
@@ -48,7 +47,12 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes.arrays import Floats, Image, Singles
 from flexsheet.nodes.models.camera import camera_matrix
-from flexsheet.nodes.models.rigid import inverse, pose_matrix, quaternion_from_rotation
+from flexsheet.nodes.models.rigid import (
+    inverse,
+    pose_matrix,
+    quaternion_from_rotation,
+    transform,
+)
 
 OWN_PREFIX = "/flexsheet/"
 WORLD = "world"
@@ -62,7 +66,7 @@ _FLOAT32 = 7
 
 
 class RosTypes:
-    """A codec for ROS 2 messages in the CDR format, which includes the types of `flexsheet_msgs`.
+    """A codec for ROS 2 messages in the CDR format, including the messages of flexsheet.
 
     Raises Ros2Error if the package rosbags is not installed.
     """
@@ -79,10 +83,9 @@ class RosTypes:
             own.update(get_types_from_msg(text, name))
         self.store.register(own)
 
-    def make(self, name: str, fields: dict[str, Any]) -> Any:
-        """Make a ROS message of the type `name`, such as `std_msgs/msg/Bool`, from its field
-        values."""
-        return self.store.types[name](**fields)
+    def make(self, kind: str, /, **fields: Any) -> Any:
+        """Make a ROS message of the type `kind`, such as `std_msgs/msg/Bool`."""
+        return self.store.types[kind](**fields)
 
     def encode(self, name: str, message: Any) -> bytes:
         """Serialize a message to CDR bytes, including the encapsulation header of four bytes."""
@@ -93,24 +96,29 @@ class RosTypes:
         return self.store.deserialize_cdr(data, name)
 
     def stamp(self, at_ns: int) -> Any:
-        return self.make("builtin_interfaces/msg/Time", split_time(at_ns))
+        return self.make("builtin_interfaces/msg/Time", **split_time(at_ns))
 
     def header(self, at_ns: int, frame: str = WORLD) -> Any:
-        return self.make("std_msgs/msg/Header", {"stamp": self.stamp(at_ns), "frame_id": frame})
+        return self.make("std_msgs/msg/Header", stamp=self.stamp(at_ns), frame_id=frame)
 
     def xyz(self, values: Any, kind: str = "Vector3") -> Any:
         x, y, z = (float(value) for value in values)
-        return self.make(f"geometry_msgs/msg/{kind}", {"x": x, "y": y, "z": z})
+        return self.make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
     def quaternion(self, rotation: Floats) -> Any:
         w, x, y, z = quaternion_from_rotation(rotation).tolist()
-        return self.make("geometry_msgs/msg/Quaternion", {"x": x, "y": y, "z": z, "w": w})
+        return self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
     def pose(self, matrix: Floats) -> Any:
-        fields = {"position": self.xyz(matrix[:3, 3], "Point")}
         return self.make(
-            "geometry_msgs/msg/Pose", fields | {"orientation": self.quaternion(matrix[:3, :3])}
+            "geometry_msgs/msg/Pose",
+            position=self.xyz(matrix[:3, 3], "Point"),
+            orientation=self.quaternion(matrix[:3, :3]),
         )
+
+    def duration(self) -> Any:
+        """Make a duration of zero."""
+        return self.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
 
 
 @cache
@@ -121,7 +129,7 @@ def load_ros_types() -> RosTypes:
 
 @dataclass(slots=True)
 class Source:
-    """The context in which a message is converted.
+    """The data that the conversion of a message needs in addition to the message.
 
     topic: topic of the message. at_ns: source timestamp of the message, ns since 1970.
     scene, skin: latest messages of the same graph; None before the first message.
@@ -136,11 +144,9 @@ class Source:
     flanges: dict[Side, Floats]
 
     def stamped(self, kind: str, name: str, value: Any, frame: str = WORLD) -> Any:
-        """Make a ROS message of type `kind` with a header and the field `name`.
-
-        frame: frame of the header.
-        """
-        return self.ros.make(kind, {"header": self.ros.header(self.at_ns, frame), name: value})
+        """Make a ROS message of the type `kind` with the field `name` and a header."""
+        header = self.ros.header(self.at_ns, frame)
+        return self.ros.make(kind, **{"header": header, name: value})
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +154,7 @@ class View:
     """A ROS topic with a standard type that represents some fields of a message.
 
     message: type of the message. fields: names of the fields. name: name of the ROS topic without
-    its first slash; {topic} is replaced by the flexsheet topic. make: function that converts a
+    the first slash, in which {topic} represents the flexsheet topic. make: function that converts a
     message, or returns None if there is nothing to publish.
     """
 
@@ -162,9 +168,9 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class RosTopic:
-    """A ROS 2 topic: name (which begins with a slash), ROS type, and whether the topic is latched.
+    """A ROS 2 topic.
 
-    Later readers of a latched topic receive its last message.
+    name: begins with a slash. latched: whether later readers receive the last message.
     """
 
     name: str
@@ -182,15 +188,13 @@ def _image(select: Callable[[Any], tuple[Image, str] | None]) -> Any:
         channels = 1 if image.ndim == 2 else image.shape[2]
         return source.ros.make(
             "sensor_msgs/msg/Image",
-            {
-                "header": source.ros.header(source.at_ns, frame),
-                "height": height,
-                "width": width,
-                "encoding": "mono8" if channels == 1 else "rgb8",
-                "is_bigendian": 0,
-                "step": width * channels,
-                "data": np.ravel(image),
-            },
+            header=source.ros.header(source.at_ns, frame),
+            height=height,
+            width=width,
+            encoding="mono8" if channels == 1 else "rgb8",
+            is_bigendian=0,
+            step=width * channels,
+            data=np.ravel(image),
         )
 
     return make
@@ -211,45 +215,38 @@ def _camera_info(side: Side) -> Callable[[StereoPair, Source], Any | None]:
             roi = dict.fromkeys(roi, 0)
         return source.ros.make(
             "sensor_msgs/msg/CameraInfo",
-            {
-                "header": source.ros.header(source.at_ns, f"camera_{side}"),
-                "height": camera.height_px,
-                "width": camera.width_px,
-                "distortion_model": "plumb_bob",
-                "d": np.array(lens.distortion),
-                "k": matrix.ravel(),
-                "r": np.eye(3).ravel(),
-                "p": np.column_stack([matrix, np.zeros(3)]).ravel(),
-                "binning_x": 0,
-                "binning_y": 0,
-                "roi": source.ros.make(
-                    "sensor_msgs/msg/RegionOfInterest", {**roi, "do_rectify": False}
-                ),
-            },
+            header=source.ros.header(source.at_ns, f"camera_{side}"),
+            height=camera.height_px,
+            width=camera.width_px,
+            distortion_model="plumb_bob",
+            d=np.array(lens.distortion),
+            k=matrix.ravel(),
+            r=np.eye(3).ravel(),
+            p=np.column_stack([matrix, np.zeros(3)]).ravel(),
+            binning_x=0,
+            binning_y=0,
+            roi=source.ros.make("sensor_msgs/msg/RegionOfInterest", **roi, do_rectify=False),
         )
 
     return make
 
 
 def _frames(source: Source, world_from: dict[str, Floats]) -> Any:
+    ros = source.ros
     transforms = [
-        source.ros.make(
+        ros.make(
             "geometry_msgs/msg/TransformStamped",
-            {
-                "header": source.ros.header(source.at_ns),
-                "child_frame_id": name,
-                "transform": source.ros.make(
-                    "geometry_msgs/msg/Transform",
-                    {
-                        "translation": source.ros.xyz(matrix[:3, 3]),
-                        "rotation": source.ros.quaternion(matrix[:3, :3]),
-                    },
-                ),
-            },
+            header=ros.header(source.at_ns),
+            child_frame_id=name,
+            transform=ros.make(
+                "geometry_msgs/msg/Transform",
+                translation=ros.xyz(matrix[:3, 3]),
+                rotation=ros.quaternion(matrix[:3, :3]),
+            ),
         )
         for name, matrix in world_from.items()
     ]
-    return source.ros.make("tf2_msgs/msg/TFMessage", {"transforms": transforms})
+    return ros.make("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
 def _static_frames(scene: Scene, source: Source) -> Any:
@@ -277,14 +274,14 @@ def _pose(source: Source, matrix: Floats) -> Any:
 
 
 def _twist(source: Source, linear: Any, angular: Any = (0.0, 0.0, 0.0)) -> Any:
-    fields = {"linear": source.ros.xyz(linear), "angular": source.ros.xyz(angular)}
-    twist = source.ros.make("geometry_msgs/msg/Twist", fields)
+    ros = source.ros
+    twist = ros.make("geometry_msgs/msg/Twist", linear=ros.xyz(linear), angular=ros.xyz(angular))
     return source.stamped("geometry_msgs/msg/TwistStamped", "twist", twist)
 
 
 def _wrench(source: Source, force: Any, frame: str = WORLD) -> Any:
-    fields = {"force": source.ros.xyz(force), "torque": source.ros.xyz(np.zeros(3))}
-    wrench = source.ros.make("geometry_msgs/msg/Wrench", fields)
+    ros = source.ros
+    wrench = ros.make("geometry_msgs/msg/Wrench", force=ros.xyz(force), torque=ros.xyz(np.zeros(3)))
     return source.stamped("geometry_msgs/msg/WrenchStamped", "wrench", wrench, frame)
 
 
@@ -310,62 +307,53 @@ def list_joints(side: str) -> list[str]:
 def _joint_states(source: Source, joints_rad: dict[str, Floats]) -> Any:
     return source.ros.make(
         "sensor_msgs/msg/JointState",
-        {
-            "header": source.ros.header(source.at_ns, ""),
-            "name": [name for side in joints_rad for name in list_joints(side)],
-            "position": np.concatenate(list(joints_rad.values())),
-            "velocity": np.zeros(0),
-            "effort": np.zeros(0),
-        },
+        header=source.ros.header(source.at_ns, ""),
+        name=[name for side in joints_rad for name in list_joints(side)],
+        position=np.concatenate(list(joints_rad.values())),
+        velocity=np.zeros(0),
+        effort=np.zeros(0),
     )
 
 
 def _joint_command(arm: ArmState, source: Source) -> Any | None:
     if not arm.command_sent_ns:
         return None
-    duration = source.ros.make("builtin_interfaces/msg/Duration", {"sec": 0, "nanosec": 0})
-    none = np.zeros(0)
-    point = source.ros.make(
+    ros, none = source.ros, np.zeros(0)
+    point = ros.make(
         "trajectory_msgs/msg/JointTrajectoryPoint",
-        {
-            "positions": arm.joints_commanded_rad,
-            "velocities": none,
-            "accelerations": none,
-            "effort": none,
-            "time_from_start": duration,
-        },
+        positions=arm.joints_commanded_rad,
+        velocities=none,
+        accelerations=none,
+        effort=none,
+        time_from_start=ros.duration(),
     )
-    header = source.ros.header(arm.command_sent_ns, "")
-    fields = {"header": header, "joint_names": list_joints(arm.side), "points": [point]}
-    return source.ros.make("trajectory_msgs/msg/JointTrajectory", fields)
+    return ros.make(
+        "trajectory_msgs/msg/JointTrajectory",
+        header=ros.header(arm.command_sent_ns, ""),
+        joint_names=list_joints(arm.side),
+        points=[point],
+    )
 
 
 def _predicted_path(fingertip: Fingertip, source: Source) -> Any | None:
     if not fingertip.valid:
         return None
     step_ns = round(fingertip.prediction_step_s * 1e9)
-    poses = []
-    for number, position in enumerate(fingertip.predicted_path_world_m):
-        matrix = np.eye(4)
-        matrix[:3, 3] = position
-        poses.append(
-            source.ros.make(
-                "geometry_msgs/msg/PoseStamped",
-                {
-                    "header": source.ros.header(source.at_ns + number * step_ns),
-                    "pose": source.ros.pose(matrix),
-                },
-            )
+    poses = [
+        source.ros.make(
+            "geometry_msgs/msg/PoseStamped",
+            header=source.ros.header(source.at_ns + number * step_ns),
+            pose=source.ros.pose(transform(np.eye(3), position)),
         )
+        for number, position in enumerate(fingertip.predicted_path_world_m)
+    ]
     return source.stamped("nav_msgs/msg/Path", "poses", poses)
 
 
 def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
     if not fingertip.valid:
         return None
-    matrix = np.eye(4)
-    matrix[:3, 3] = fingertip.position_world_m
-    return _frames(source, {"fingertip": matrix})
+    return _frames(source, {"fingertip": transform(np.eye(3), fingertip.position_world_m)})
 
 
 def _eye_pose(eye: Eye, source: Source) -> Any | None:
@@ -379,33 +367,27 @@ def _eye_pose(eye: Eye, source: Source) -> Any | None:
     helper = np.eye(3)[1 if abs(x_axis[1]) < 0.9 else 2]
     z_axis = np.cross(x_axis, helper)
     z_axis /= np.linalg.norm(z_axis)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.column_stack([x_axis, np.cross(z_axis, x_axis), z_axis])
-    matrix[:3, 3] = eye.centre_world_m
-    return _pose(source, matrix)
+    rotation = np.column_stack([x_axis, np.cross(z_axis, x_axis), z_axis])
+    return _pose(source, transform(rotation, eye.centre_world_m))
 
 
 def _points(source: Source, points: Singles) -> Any:
-    field_type = "sensor_msgs/msg/PointField"
+    kind = "sensor_msgs/msg/PointField"
     fields = [
-        source.ros.make(
-            field_type, {"name": name, "offset": 4 * i, "datatype": _FLOAT32, "count": 1}
-        )
+        source.ros.make(kind, name=name, offset=4 * i, datatype=_FLOAT32, count=1)
         for i, name in enumerate("xyz")
     ]
     return source.ros.make(
         "sensor_msgs/msg/PointCloud2",
-        {
-            "header": source.ros.header(source.at_ns),
-            "height": 1,
-            "width": len(points),
-            "fields": fields,
-            "is_bigendian": False,
-            "point_step": 12,
-            "row_step": 12 * len(points),
-            "data": np.ascontiguousarray(points, dtype="<f4").view(np.uint8).ravel(),
-            "is_dense": True,
-        },
+        header=source.ros.header(source.at_ns),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(points),
+        data=np.ascontiguousarray(points, dtype="<f4").view(np.uint8).ravel(),
+        is_dense=True,
     )
 
 
@@ -431,43 +413,36 @@ def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floa
     return np.array(corners)
 
 
-def _flange_frame(arm: ArmState, source: Source) -> Any:
-    return _frames(source, {f"{arm.side}_flange_measured": arm.world_from_flange})
-
-
 def _sheet_marker(_: ArmState, source: Source) -> Any | None:
     corners = find_sheet_corners(source.scene, source.flanges)
     if corners is None:
         return None
     ros = source.ros
     red, green, blue, alpha = SHEET_COLOUR
-    colour = ros.make("std_msgs/msg/ColorRGBA", {"r": red, "g": green, "b": blue, "a": alpha})
-    texture = {"header": ros.header(0, ""), "format": "", "data": np.zeros(0, np.uint8)}
-    duration = ros.make("builtin_interfaces/msg/Duration", {"sec": 0, "nanosec": 0})
-    mesh = {"filename": "", "data": np.zeros(0, np.uint8)}
+    no_bytes = np.zeros(0, np.uint8)
     return ros.make(
         "visualization_msgs/msg/Marker",
-        {
-            "header": ros.header(source.at_ns),
-            "ns": "sheet",
-            "id": 0,
-            "type": _TRIANGLE_LIST,
-            "action": 0,
-            "pose": ros.pose(np.eye(4)),
-            "scale": ros.xyz((1.0, 1.0, 1.0)),
-            "color": colour,
-            "lifetime": duration,
-            "frame_locked": False,
-            "points": [ros.xyz(corners[i], "Point") for i in (0, 2, 1, 1, 2, 3)],
-            "colors": [],
-            "texture_resource": "",
-            "texture": ros.make("sensor_msgs/msg/CompressedImage", texture),
-            "uv_coordinates": [],
-            "text": "",
-            "mesh_resource": "",
-            "mesh_file": ros.make("visualization_msgs/msg/MeshFile", mesh),
-            "mesh_use_embedded_materials": False,
-        },
+        header=ros.header(source.at_ns),
+        ns="sheet",
+        id=0,
+        type=_TRIANGLE_LIST,
+        action=0,
+        pose=ros.pose(np.eye(4)),
+        scale=ros.xyz((1.0, 1.0, 1.0)),
+        color=ros.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
+        lifetime=ros.duration(),
+        frame_locked=False,
+        points=[ros.xyz(corners[i], "Point") for i in (0, 2, 1, 1, 2, 3)],
+        colors=[],
+        texture_resource="",
+        texture=ros.make(
+            "sensor_msgs/msg/CompressedImage", header=ros.header(0, ""), format="", data=no_bytes
+        ),
+        uv_coordinates=[],
+        text="",
+        mesh_resource="",
+        mesh_file=ros.make("visualization_msgs/msg/MeshFile", filename="", data=no_bytes),
+        mesh_use_embedded_materials=False,
     )
 
 
@@ -507,7 +482,8 @@ VIEWS = (
     View(ArmState, "world_from_flange", "{topic}/flange", _POSE,
          lambda arm, source: _pose(source, arm.world_from_flange)),
     View(ArmState, "world_from_flange", "tf", _TF,
-         _flange_frame),
+         lambda arm, source: _frames(
+             source, {f"{arm.side}_flange_measured": arm.world_from_flange})),
     View(ArmState, "world_from_flange of both arms", "sheet/marker",
          "visualization_msgs/msg/Marker", _sheet_marker),
     View(Skin, "vertices_world_m", "{topic}/points", _CLOUD,
@@ -520,7 +496,7 @@ VIEWS = (
          _image(lambda frame: (frame.pixels[0], "projector") if frame.pixels else None)),
     View(Eye, "centre_world_m, right_world", "{topic}/pose", _POSE, _eye_pose),
     View(EStop, "engaged", "{topic}/engaged", "std_msgs/msg/Bool",
-         lambda estop, source: source.ros.make("std_msgs/msg/Bool", {"data": estop.engaged}),
+         lambda estop, source: source.ros.make("std_msgs/msg/Bool", data=estop.engaged),
          latched=True),
     View(TwinFinger, "position_world_m", "{topic}/point", _POINT,
          lambda finger, source: _point(source, finger.position_world_m)),
@@ -541,7 +517,7 @@ VIEWS = (
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
     """Return the ROS topics for a flexsheet topic, with their views.
 
-    Topics with standard types come first. The last topic contains all fields, and its view is None.
+    Topics with standard types come first. The last topic contains all fields and has no view.
     """
     found: list[tuple[RosTopic, View | None]] = [
         (RosTopic("/" + view.name.format(topic=topic.name), view.ros_type, view.latched), view)
@@ -557,7 +533,7 @@ def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
 class Converter:
     """A converter of the messages of one graph to ROS 2.
 
-    The converter stores the latest scene, skin and flange poses, which later conversions need.
+    The latest scene, skin and flange poses are stored, because later conversions need them.
     """
 
     ros: RosTypes
@@ -573,10 +549,10 @@ class Converter:
         shift_ns: int,
         wanted: Callable[[RosTopic], bool] = lambda _: True,
     ) -> Iterator[tuple[RosTopic, Any]]:
-        """Convert a message, and yield each resulting ROS message with its ROS topic.
+        """Convert a message, and yield pairs of a ROS topic and a ROS message.
 
         shift_ns: difference between the time since 1970 and the clock of the header. wanted:
-        function that returns whether a ROS topic needs a message.
+        function that returns whether messages of a ROS topic are needed.
         """
         match message:
             case Scene():
@@ -591,17 +567,15 @@ class Converter:
         for ros_topic, view in list_ros_topics(TOPICS[topic]):
             if not wanted(ros_topic):
                 continue
-            made = self._make_own(message, header, at_ns) if view is None else view.make(
-                message, source
-            )  # fmt: skip
+            if view is not None:
+                made = view.make(message, source)
+            else:
+                made = self.ros.make(
+                    ros_name(type(message)),
+                    header=self.ros.header(at_ns),
+                    writer=header.writer,
+                    sequence_number=header.sequence,
+                    **convert_fields(message, self.ros.make),
+                )
             if made is not None:
                 yield ros_topic, made
-
-    def _make_own(self, message: Message, header: Header, at_ns: int) -> Any:
-        first = {
-            "header": self.ros.header(at_ns),
-            "writer": header.writer,
-            "sequence_number": header.sequence,
-        }
-        fields = convert_fields(message, self.ros.make)
-        return self.ros.make(ros_name(type(message)), first | fields)

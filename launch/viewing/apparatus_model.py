@@ -1,4 +1,4 @@
-"""Describe the hardware of a scene (arms, camera, projector, sheet) by links and joints, like URDF.
+"""Describe the arms, camera, projector and sheet of a scene by links and joints, as in URDF.
 
 Links of each arm: `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`,
 where SIDE is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`, `projector`
@@ -34,8 +34,7 @@ LENS: Colour = (0.0, 0.42, 0.58, 1.0)
 SCREEN: Colour = (0.97, 0.93, 0.84, 0.35)
 
 CAMERA_BODY_M: Vector = (0.05, 0.035, 0.045)
-"""The size (x, y, z), in metres, of the drawn housing of a camera, which is centred behind the
-lens."""
+"""The size (x, y, z), in metres, of the drawn housing of a camera behind the lens."""
 PROJECTOR_BODY_M: Vector = (0.16, 0.07, 0.12)
 LENS_LENGTH_M = 0.01
 
@@ -62,8 +61,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class JointLimit:
-    """The rotation axis in the frame of the child link, range and maximum speed of a revolute
-    joint."""
+    """The axis (in the frame of the child link), range and maximum speed of a revolute joint."""
 
     axis: Vector
     min_rad: float
@@ -86,8 +84,7 @@ class Joint:
     limit: JointLimit | None = None
 
     def pose(self, angle_rad: float) -> Floats:
-        """Return the pose (4, 4) of the child link at a joint angle; a fixed joint ignores the
-        angle."""
+        """Return the pose (4, 4) of the child link; the angle of a fixed joint has no effect."""
         if self.limit is None:
             return self.parent_from_child
         rotation = rotation_from_vector(angle_rad * np.array(self.limit.axis))
@@ -96,8 +93,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class ApparatusModel:
-    """The links and joints of the apparatus, sorted so that parent links precede their child
-    links."""
+    """The links and joints of the apparatus; parent links precede their child links."""
 
     name: str
     links: tuple[Link, ...]
@@ -132,10 +128,9 @@ def make_model(scene: Scene) -> ApparatusModel:
 
 
 def solve_rest_joints(scene: Scene) -> dict[str, float]:
-    """Return the joint angles (rad), by joint name, with which the arms hold the sheet at the
-    screen.
+    """Return the joint angles (rad), by name, of arms that hold the sheet at the screen.
 
-    For an arm that cannot reach the screen, the centres of its joint ranges are returned.
+    If an arm cannot reach the screen, its joint angles are the centres of their ranges.
     """
     angles: dict[str, float] = {}
     for side in get_args(Side):
@@ -206,10 +201,9 @@ def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]
 
 
 def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:
-    """Return boxes for the housing and the lens of a device; the lens is at the origin and faces
-    +z.
+    """Return boxes for the housing and the lens of a device that faces +z.
 
-    body_m: size of the housing. lens_m: size of the lens.
+    The centre of the lens is the origin. body_m: size of the housing. lens_m: width of the lens.
     """
     depth_m = body_m[2]
     return (

@@ -1,8 +1,8 @@
 """Write the model of the apparatus as glTF 2.0, for 3D viewers and modelling programs.
 
-A joint is a glTF node of the same name, and its child link is the node below it. Rotating the node
-of a joint therefore moves all following links. The `extras` of the node contain the axis and the
-range of the joint. As is usual in glTF, y points up and z points to the user.
+Each joint and each link is a glTF node of the same name. The node of a joint contains the nodes of
+all following links, and its `extras` contain the axis and the range of the joint. As is usual in
+glTF, y points up and z points to the user.
 """
 
 from __future__ import annotations

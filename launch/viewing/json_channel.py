@@ -86,10 +86,10 @@ def _describe_type(kind: type) -> JsonSchema:
 
 
 def _merge(schemas: list[JsonSchema]) -> JsonSchema:
-    """Return one JSON Schema that describes values of several types.
+    """Return one JSON Schema for values of several types.
 
-    If all types are objects, the schema contains the fields of all types. Otherwise it describes an
-    array or text.
+    The schema of several objects has the fields of all objects. The schema of other combinations
+    is an array or text.
     """
     if not schemas:
         return _TEXT

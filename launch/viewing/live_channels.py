@@ -71,18 +71,15 @@ VIEWER_FROM_WORLD = transform(rotation_from_vector((0.5 * np.pi, 0.0, 0.0)), np.
 EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
 EYE_RADIUS_M = 0.011
 SHEET_STEP = 2
-"""The step between the mesh rows and columns of the sheet that are sent to viewers.
-
-For example, 2 means that every second row and column is sent.
-"""
+"""Every SHEET_STEP-th row and column of the sheet's mesh is sent to viewers."""
 JPEG_QUALITY = 80
 
 
 class Pace(Enum):
-    """The rule that determines how often a channel sends messages.
+    """The maximum rate of a channel.
 
-    NUMBERS, IMAGES: at most at the configured rate of numbers or images. EACH: at every message.
-    STATIC: when the scene changes, and once per second for viewers that connect later.
+    NUMBERS, IMAGES: the configured rate of numbers or images. EACH: not limited. STATIC: when the
+    scene changes, and once per second for viewers that connect later.
     """
 
     NUMBERS = "numbers"
@@ -93,7 +90,7 @@ class Pace(Enum):
 
 @dataclass(slots=True)
 class LiveState:
-    """The latest message of each topic, together with the model of the apparatus and its joints."""
+    """The latest message of each topic, and the model of the apparatus in the latest scene."""
 
     latest: dict[str, Message] = field(default_factory=dict)
     model: ApparatusModel | None = None
@@ -116,8 +113,7 @@ class LiveState:
         return found if isinstance(found, Fingertip) else None
 
     def edges(self) -> tuple[Floats, Floats] | None:
-        """Return the world poses (4, 4) of the left and right clamped edge; None if they are
-        unknown."""
+        """Return the world poses (4, 4) of the left and the right edge; None if one is unknown."""
         scene, found = self.scene, []
         for side in get_args(Side):
             state = self.latest.get(f"arm_{side}")
@@ -132,10 +128,10 @@ class LiveState:
 class LiveChannel:
     """A channel that viewers can display.
 
-    topics: topics of the graph that the channel needs in addition to the scene. triggers: topics
-    whose messages cause the channel to send. make: function (state, received message, timestamp)
-    that returns a message of the channel, or None if there is nothing to send. schema: JSON Schema,
-    or None for messages of the Foxglove type `kind`.
+    topics: topics that the channel needs in addition to the scene. triggers: topics that cause the
+    channel to send a message. make: function (state, received message, timestamp) that returns a
+    message of the channel, or None if there is nothing to send. kind: Foxglove type of the
+    messages; empty for JSON. schema: JSON Schema of JSON messages.
     """
 
     name: str

@@ -1,9 +1,9 @@
 """Serve a running graph to Foxglove and Lichtblick over their WebSocket protocol, read-only.
 
-The server of the Foxglove SDK has no authentication and accepts requests from any web page. It
-therefore listens on the loopback interface only. Viewers cannot publish, call services or change
-parameters. A topic is read from the graph only while a viewer has subscribed to a channel that
-needs it. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
+The server of the Foxglove SDK has no authentication and accepts requests from any web page.
+Therefore the server listens on the loopback interface only. Viewers cannot publish, call services
+or change parameters. Topics are read from the graph only while viewers subscribe to channels that
+need them. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
 """
 
 from __future__ import annotations
@@ -45,18 +45,12 @@ UPDATE_S = 0.1
 STATIC_S = 1.0
 TIME_S = 1.0 / 30.0
 ALWAYS_READ = frozenset({"scene", "status"})
-"""The topics that the server always reads.
-
-They are small, and contain the scene and the values of parameters.
-"""
+"""The topics that the server always reads, because they contain scene and parameters."""
 URDF_PARAMETER = "/robot_description"
 
 
 class ReadOnlyParameters(ServerListener):
-    """A listener that answers the viewers' requests for parameters.
-
-    It ignores requests to change parameters, and answers them with the present values.
-    """
+    """A listener that returns parameters to viewers, and ignores changes of parameters."""
 
     def __init__(self) -> None:
         self.values: dict[str, Any] = {}
@@ -76,11 +70,10 @@ class ReadOnlyParameters(ServerListener):
 
 
 class LiveServer:
-    """A server that sends the data of one running graph to viewers.
+    """A server that sends the data of one running graph to viewers in a running event loop.
 
-    The server requires a running event loop. rate_hz: maximum rate of numbers per channel.
-    image_rate_hz: maximum rate of images and meshes per channel. port: TCP port; 0 selects a free
-    port. on_problem: function that is called with the text of an error.
+    rate_hz, image_rate_hz: maximum rates per channel, of numbers and of images and meshes. port:
+    TCP port; 0 selects a free port. on_problem: function that is called with the text of an error.
     """
 
     def __init__(
@@ -142,10 +135,7 @@ class LiveServer:
         return set(self._subscribers)
 
     async def serve(self) -> None:
-        """Serve viewers until the calling task is cancelled.
-
-        Raises the exceptions of the server's tasks.
-        """
+        """Send data to viewers until the calling task is cancelled."""
         await asyncio.gather(*self._tasks)
 
     def close(self) -> None:
@@ -243,10 +233,7 @@ class LiveServer:
 
 
 def _make_plain(value: Any) -> Any:
-    """Convert a value to a parameter type of Foxglove.
-
-    Numbers become floats, bool values are unchanged, and all other values become text.
-    """
+    """Convert a value to a parameter of Foxglove: a float, a bool or a text."""
     if isinstance(value, bool | str):
         return value
     if isinstance(value, int | float):
