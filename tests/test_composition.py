@@ -210,7 +210,7 @@ def make_choice(family: str, *evaluations: MethodEvaluation) -> Choice:
     return Choice(family, key, "mm", 1.0, choose(evaluations), evaluations)
 
 
-def test_stages_are_made_of_the_measured_families() -> None:
+def test_stages_are_made_of_the_measured_families(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene(SCENES / "light-touch.yaml")
     horizons = [{HORIZON_MS: 0, "factor": 1.0}, {HORIZON_MS: 20, "factor": 2.0},
              {HORIZON_MS: 50, "factor": 3.0}]  # fmt: skip
@@ -220,6 +220,7 @@ def test_stages_are_made_of_the_measured_families() -> None:
         asked.append(noise_px)
         return evaluate("adaptive", 10.0 * noise_px, 1e-4, cases=horizons)
 
+    monkeypatch.setattr(tune_system, "measure_tracking", measure)
     stages = tune_system.make_stages(
         scene,
         [
@@ -230,7 +231,6 @@ def test_stages_are_made_of_the_measured_families() -> None:
             make_choice("correction", *evaluate("two_pass", 0.2, 1.0)),
             make_choice("soft-body", *evaluate("linear", 0.1, 1e-3, extra_metrics={FORCE: -7.0})),
         ],
-        measure,
     )
     assert asked == [0.01]  # tuned with the noise of the chosen marker, measured for the others
     coarse, fine = stages["tracking"]
@@ -319,11 +319,11 @@ def test_a_shipped_scene_keeps_its_choice_and_an_interrupted_tuning_continues(
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
     monkeypatch.setattr(Configuration, "prepare", lambda *_: None)
+    monkeypatch.setattr(tune_system, "measure_tracking", lambda *_: tracking.evaluations)
 
     def tune() -> tuple[Any, tuple[Choice, ...]]:
         composition, chosen = tune_system.tune_system(
             scene_file, choices, tmp_path, lambda text: None, margin=0.2, runs=3,
-            measure=lambda *_: tracking.evaluations,
         )  # fmt: skip
         return composition, tuple(chosen)
 

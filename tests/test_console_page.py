@@ -20,7 +20,7 @@ from playwright.async_api import Page, async_playwright, expect
 
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import runs
-from flexsheet.launch.running.runs import Run, local_endpoints
+from flexsheet.launch.running.runs import Run, local_sources
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header, Message
@@ -75,7 +75,7 @@ async def hearing(graph: RunningGraph, *names: str) -> AsyncIterator[ReceivedMes
     for name in names:
         subscriber = Subscriber(
             find_topic(name),
-            local_endpoints(graph.run, graph.plan.endpoints_to_read(name)),
+            local_sources(graph.run, graph.plan.sources_to_read(name)),
             lambda message, header, name=name: inbox.take(name, message, header),
             PortCounts(),
         )

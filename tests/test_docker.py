@@ -62,9 +62,7 @@ def test_each_host_has_a_container_that_ends_in_order_and_remembers(name: str) -
 
 def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
     lab = ROOT / "launch" / "lab.yaml"
-    # Some command that is there: the unit is looked at, not started.
-    made = list(make_files(launch_file=lab, host="left", user="root", root=tmp_path,
-                         flexsheet=Path("/bin/true")))  # fmt: skip
+    made = list(make_files(launch_file=lab, host="left", user="root", root=tmp_path))
     assert "FLEXSHEET_STATE=/var/lib/flexsheet" in made[0].text
     assert not re.search("@[A-Z]+@", made[0].text)
     if shutil.which("systemd-analyze") is None:

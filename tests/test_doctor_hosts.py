@@ -378,9 +378,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
 def test_own_keys_and_address_are_checked_before_the_start(
     folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "flexsheet.launch.health.doctor_hosts.find_opengl_problem", lambda: "no EGL"
-    )
+    monkeypatch.setattr("flexsheet.launch.health.doctor.find_opengl_problem", lambda: "no EGL")
     assert "does not exist; create a key" in (find_key_problem(three, "main") or "")
     public, secret = make_key_pair()
     write_secret(secret_file("main"), secret)

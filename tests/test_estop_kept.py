@@ -25,6 +25,7 @@ from flexsheet.launch.running.host import (
     has_manual_arming,
     list_arms,
 )
+from flexsheet.launch.running.runs import Run
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
@@ -77,11 +78,7 @@ class Launchers:
         self._epoch, self._sequence = self._clock.now_ns(), 0
         for host in self.plan.hosts:
             self.agents[host] = HostAgent(
-                self.plan, host, run_id="1", code="", processes=tuple, pids=dict,
-                endpoints=lambda ends: tuple(map(self._near, ends)),
-                sources=lambda ones: tuple(
-                    Source(self._near(one.endpoint), one.writer, one.host) for one in ones
-                ),
+                self.plan, host, run=Run("1", self.folder), code="", processes=tuple, pids=dict,
                 keys=None, on_problem=self.printed.append,
             )  # fmt: skip
             self.agents[host].start()

@@ -140,16 +140,23 @@ STAGED = Tunable("marker", ("quick", "slow"), {"cheap": "moments", "dear": "subp
     [(0.1, ["cheap"], "cheap"), (2.0, ["cheap", "dear"], "dear")],
 )
 def test_slow_methods_are_measured_only_if_no_other_is_sufficient(
-    stand_ins: list[str], cheap_error: float, methods: list[str], chosen: str
+    stand_ins: list[str],
+    cheap_error: float,
+    methods: list[str],
+    chosen: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def measured(asked: Family, scene: Scene, wanted: Callable[[Trial], bool]) -> Sequence[Point]:
+    def measured(
+        asked: Family, scene: Scene, *, select: Callable[[Trial], bool], **_: Any
+    ) -> Sequence[Point]:
         errors = {"cheap": cheap_error, "dear": 0.1}
         trials = [Trial(name, {}, lambda: None, lambda _: 0.0, True) for name in asked.methods]
-        new = [trial.method for trial in trials if wanted(trial)]
+        new = [trial.method for trial in trials if select(trial)]
         stand_ins.extend(new)
         return [point(name, errors[name]) for name in new]
 
-    (choice,) = tune.tune(SCENE, [STAGED], measure=measured)
+    monkeypatch.setattr(tune, "measure_family", measured)
+    (choice,) = tune.tune(SCENE, [STAGED])
     assert stand_ins == methods
     assert choice.chosen.method == chosen
     assert choice.met
@@ -193,15 +200,16 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
     monkeypatch.setattr(tune, "load_family", there.__getitem__)
     errors = {"four_triangles": 0.2, "reduced_order": 0.1, "one_plane": 9.0}
 
-    def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
+    def measured(asked: Family, scene: Scene, **_: Any) -> Sequence[Point]:
         return [point(name, errors.get(name, 0.3), took=1e-3) for name in asked.methods]
 
+    monkeypatch.setattr(tune, "measure_family", measured)
     tunables = find_tunables(["correction", "sheet-shape"], SCENE)
-    shape, correction = tune.tune(SCENE, tunables, measure=measured)
+    shape, correction = tune.tune(SCENE, tunables)
     assert shape.chosen.setting == "reduced_order"  # as quick as the others, and more exact
     assert (correction.chosen.method, correction.chosen.setting) == ("two_pass", "two_pass")
     errors["reduced_order"] = 9.0
-    shape, correction = tune.tune(SCENE, tunables, measure=measured)
+    shape, correction = tune.tune(SCENE, tunables)
     assert shape.chosen.setting == "four_triangles"
     assert correction.chosen.method == "two_pass_triangles"
     assert correction.chosen.setting == "two_pass"

@@ -501,7 +501,7 @@ def make_listener(
     from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)
-    if not plan.endpoints_to_read(topic.name):
+    if not plan.writers.get(topic.name):
         raise CommandError(
             f'topic "{topic.name}" has no writer in the running graph {run.directory}; '
             "add a node that publishes it to the launch file",

@@ -62,8 +62,8 @@ def compute_front_curve(
     """Return the force of the object on the side that faces the user, as a function of push depth.
 
     The result has rows (n, 2) of depth (m) and force (N). The linear method is used only if the
-    scene chooses it. Otherwise, if the nonlinear table of the object is not cached, it is computed
-    and cached, which takes minutes.
+    scene chooses it. Otherwise, the nonlinear table of the object is used. If this table is not
+    cached, its computation takes minutes.
 
     cache_dir: folder of the cache; None: the user's cache folder.
     on_progress: function that is called with the numbers of finished and of all steps.
@@ -91,7 +91,7 @@ def compute_compliance(
     max_depth_m: float | None = None,
     bounds: OffsetBounds | None = None,
 ) -> Compliance:
-    """Compute the offsets of the sheet by which the planner renders the object's force.
+    """Compute the offsets of the sheet that render the object's force.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.

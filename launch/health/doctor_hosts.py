@@ -17,8 +17,8 @@ from typing import Literal
 
 import psutil
 
-from flexsheet.launch.health.doctor import MIN_FREE_DISK_BYTES, check_libraries
-from flexsheet.launch.health.opengl import OPENGL_REMEDY, find_opengl_problem
+from flexsheet.launch.health.doctor import MIN_FREE_DISK_BYTES, check_libraries, check_opengl
+from flexsheet.launch.health.opengl import OPENGL_REMEDY
 from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.plans.hosts import is_loopback
 from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
@@ -551,11 +551,8 @@ def check_before_start(
     devices = list_device_files(nodes)
     yield from _report_devices(here, devices, [one for one in devices if not os.path.exists(one)])
     if any(node.role is NodeRole.RENDERER for node in nodes):
-        problem = find_opengl_problem()
-        if problem is None:
-            yield HostFinding(here, "opengl", "ok", "a headless context can be created (EGL)")
-        else:
-            yield HostFinding(here, "opengl", "failed", problem, OPENGL_REMEDY)
+        opengl = check_opengl()
+        yield HostFinding(here, opengl.check, opengl.state, opengl.what, opengl.remedy)
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
             yield _check_controller(here, node)

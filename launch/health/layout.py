@@ -387,7 +387,7 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
 
 
 def _find_largest(scene: Scene, key: str, step: float) -> float | None:
-    """Return the largest value of a key of the working range with which the range is reachable.
+    """Return the largest value of one key with which the whole working range is reachable.
 
     The search is a bisection over the multiples of `step` below the value in the scene. Return None
     if no tested value is reachable.
@@ -418,7 +418,7 @@ def _is_reachable(scene: Scene) -> bool:
 
 
 def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
-    """Return a copy of the scene in which the base of one arm is moved.
+    """Return a copy of the scene with a moved base of one arm.
 
     offset_m: displacement (3,) in the world frame.
     """
@@ -433,7 +433,7 @@ def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
 
 
 def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
-    """Return the smallest displacement (3,), in m, of a base with which all samples are reachable.
+    """Return the smallest displacement (3,), in m, of a base that makes all samples reachable.
 
     Return None if no tested displacement is sufficient.
     """
@@ -495,9 +495,9 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the fraction of samples for which a limit is the most violated one.
+    """Return the fraction of the samples that violate a limit most.
 
-    The result also contains the sample with the smallest tilt among them.
+    The result also contains the one of these samples with the smallest tilt.
 
     number: index of the limit.
     binding: index (n,) of the most violated limit of each sample; -1 for reachable samples.

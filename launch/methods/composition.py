@@ -78,10 +78,9 @@ Figures = Mapping[SystemMetric, float]
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """The difference by which measured system metrics exceed predicted ones, learned from graph
-    runs.
+    """The excess of measured over predicted system metrics, learned from runs of the graph.
 
-    The difference is added to later predictions.
+    This excess is added to later predictions.
     """
 
     parts: Figures = field(default_factory=dict)
@@ -213,7 +212,7 @@ class Composition:
 
     @property
     def unmet(self) -> list[str]:
-        """Return the metrics that exceed their tolerance, and the stages whose method is out of
+        """Return the metrics that exceed their tolerance, and the stages with a method out of
         range."""
         stages = [stage for stage, option in self.chosen.items() if not option.in_range]
         return [*self.last.exceeded, *(f"{stage} out of range" for stage in stages)]
@@ -271,7 +270,6 @@ def compose(
     run_graph: Callable[[Combination], Figures],
     *,
     margin: float,
-    max_runs: int = MAX_RUNS,
 ) -> Composition:
     """Find the cheapest combination of methods that meets all tolerances in a run of the graph.
 
@@ -304,7 +302,7 @@ def compose(
         )
         return runs[-1]
 
-    while len(runs) < max_runs and len(tried) < len(combinations):
+    while len(runs) < MAX_RUNS and len(tried) < len(combinations):
         left = [one for one in combinations if one not in tried]
         proposed = _propose(left, unexplained, allowed)
         if runs and excess(predict(proposed, unexplained), allowed):
@@ -320,7 +318,7 @@ def compose(
         ):
             break
     best = _find_best(runs, tolerances)
-    while len(runs) < max_runs:
+    while len(runs) < MAX_RUNS:
         cheaper = _find_cheaper(combinations, tried, runs[best], tolerances, margin)
         if cheaper is None:
             break
@@ -352,9 +350,9 @@ def _find_cheaper(
     """Return the cheapest untested combination that is cheaper than the best run and may be as
     good.
 
-    Returns None if there is no such combination. The errors of a method are those of its worst
-    case, so that their sum overestimates the errors of the system. This is corrected by the ratio
-    of measured to predicted errors of the best run.
+    Returns None if there is no such combination. The errors of a method are worst-case errors, so
+    the sum of all methods overestimates the errors of the system. This is corrected by the ratio of
+    measured to predicted errors of the best run.
     """
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     limits = _relax(allowed, [best.measured])
@@ -373,9 +371,9 @@ def _find_cheaper(
 
 
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
-    """Return the cheapest combination whose predicted metrics are within the attainable limits.
+    """Return the cheapest combination with predicted metrics within the attainable limits.
 
-    limits: wanted limits, which are raised to the values that can be attained. If no combination is
+    limits: wanted limits, before they are raised to attainable values. If no combination is
     within all limits, return the combination with the smallest excess.
     """
     predicted = [predict(one, unexplained) for one in left]

@@ -104,8 +104,8 @@ class Configuration:
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
         """Compute and cache the tables that the methods need.
 
-        Nodes replace missing tables by other methods, which would then be measured. The table of a
-        soft body takes minutes.
+        Otherwise, nodes would replace missing tables by other methods, and these would be measured.
+        The table of a soft body takes minutes.
         """
         if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)
@@ -121,7 +121,7 @@ class Configuration:
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return the cheapest method of each family whose range covers the scene's working range.
+    """Return the cheapest method of each family that covers the scene's working range.
 
     Errors are not considered. If no method of a method family has a sufficient range, the method
     with the largest range is returned.

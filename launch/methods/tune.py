@@ -49,7 +49,6 @@ TIE_RATIO = 1.1
 Of equally fast methods, the most accurate one is chosen.
 """
 
-Measure = Callable[[Family, Scene, Callable[[Trial], bool]], Sequence[Point]]
 Setting = str | dict[str, Any]
 
 
@@ -62,7 +61,7 @@ class UnknownTunableError(FlexsheetError, KeyError):
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """A method family whose method can be chosen in a scene.
+    """A method family, of which a scene can choose one method.
 
     families: locations `module:NAME` of the `Family` objects that form the method family, in the
     order of measurement. Later objects take minutes to prepare, and are measured only if no earlier
@@ -359,14 +358,12 @@ def tune(
     tunables: Sequence[Tunable],
     *,
     margin: float = MARGIN,
-    measure: Measure | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Choice]:
     """Measure the methods of all given families in order, and choose one method per family.
 
-    margin: fraction of each tolerance that is reserved. measure: function that replaces the
-    measurement in tests. Errors of method families that do not support the scene's shape, mesh or
-    sheet are raised.
+    margin: fraction of each tolerance that is reserved. Errors of method families that do not
+    support the scene's shape, mesh or sheet are raised.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
@@ -379,9 +376,7 @@ def tune(
         load = load_family
         if tunable.name == "tracking" and (marker := find_choice(choices, "marker")) is not None:
             load = partial(_load_tracking, noise_px=marker.chosen.error)
-        choice = _tune_family(
-            scene, tunable, settings, load, margin=margin, measure=measure, progress=report
-        )
+        choice = _tune_family(scene, tunable, settings, load, margin=margin, progress=report)
         if tunable.name == "sheet-shape":
             shape = choice.chosen.method
         choices.append(choice)
@@ -413,7 +408,6 @@ def _tune_family(
     load: Callable[[str], Family],
     *,
     margin: float,
-    measure: Measure | None,
     progress: Callable[[str], None],
 ) -> Choice:
     evaluations: list[MethodEvaluation] = []
@@ -429,12 +423,7 @@ def _tune_family(
             continue
         progress(f"measuring {', '.join(left)}")
         select = partial(_is_selected, left)
-        if measure is not None:
-            points = measure(family, scene, select)
-        else:
-            points = measure_family(
-                family, scene, repeats=REPEATS, progress=progress, select=select
-            )
+        points = measure_family(family, scene, repeats=REPEATS, progress=progress, select=select)
         evaluations += evaluate_methods(
             points, left, tolerance=family.tolerance(scene), margin=margin
         )
@@ -590,7 +579,7 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
         if old is None:
             what = f'contains "{name}", which cannot be made relative to {there}'
             remedy = "give the absolute path, or an --output file in the scene's folder"
-            raise BadInputError([Problem(f"{source}:{line + 1}", key, what, remedy)])
+            raise BadInputError.single(f"{source}:{line + 1}", key, what, remedy)
         new = json.dumps(os.path.relpath(here / name, there), ensure_ascii=False)
         lines[line] = lines[line][:column] + new + rest[len(old) :]
     return "".join(lines)
@@ -599,7 +588,7 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
 def check_target(source: Path, target: Path) -> None:
     """Raise BadInputError if the target cannot be written.
 
-    The check runs before a long measurement, so that its result is not lost.
+    The check runs before a long measurement to protect its result.
     """
     relocate_paths(_read(source), source, target)
     try:
@@ -614,12 +603,11 @@ def check_target(source: Path, target: Path) -> None:
 
 def _write_problem(target: Path, error: OSError) -> BadInputError:
     if error.errno in DISK_ERRORS:
-        return BadInputError(
-            [Problem(str(make_write_error(target, error)), (), "the file is unchanged")]
-        )
+        text = str(make_write_error(target, error))
+        return BadInputError.single(text, (), "the file is unchanged")
     what = f"cannot be written: {error.strerror or error}"
     remedy = "give --output FILE in an existing, writable folder"
-    return BadInputError([Problem(str(target), (), what, remedy)])
+    return BadInputError.single(str(target), (), what, remedy)
 
 
 def _read(source: Path) -> str:
@@ -656,13 +644,8 @@ def write_choices(
         after = _load_draft(draft, source)
         same = {"methods": before.methods}
         if after.model_copy(update=same).model_dump_json() != before.model_dump_json():
-            problem = Problem(
-                str(source),
-                (METHODS,),
-                "inserting the choices would change other parts of the scene",
-                "edit the file manually",
-            )
-            raise BadInputError([problem])
+            what = "inserting the choices would change other parts of the scene"
+            raise BadInputError.single(str(source), (METHODS,), what, "edit the file manually")
         shutil.copymode(path if path.exists() else source, draft)
         draft.replace(path)
     except OSError as error:
@@ -674,7 +657,7 @@ def write_choices(
 def _load_draft(draft: Path, source: Path) -> Scene:
     """Load a temporary copy of a scene file that contains the choices.
 
-    Errors name the source file instead of the copy, which the user does not know.
+    Errors name the source file, because the user does not know the copy.
     """
     try:
         return load_scene(draft)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.methods import Methods
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.benchmarks import FORCE
-from flexsheet.nodes.methods import Point, Trial
+from flexsheet.nodes.methods import Point
 from flexsheet.nodes.triangulator.tracking_benchmark import HORIZON_MS, make_tracking_family
 
 RENDERED_HZ = 30.0
@@ -49,7 +50,7 @@ IMAGES = 2
 """The number of images per exposure in which the marker is detected."""
 
 STROKE_S = 10.0
-MeasureTracking = Callable[[Scene, float], Sequence[MethodEvaluation]]
+ERROR: Callable[[Point], float] = attrgetter("error")
 
 
 def list_tolerances(scene: Scene) -> dict[SystemMetric, float]:
@@ -67,18 +68,12 @@ def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
     from flexsheet.launch.methods.benchmarks import make_finger_motions
 
     family = make_tracking_family(make_finger_motions, noise_px)
-    points = measure_family(family, scene, repeats=REPEATS, select=_is_in_scene)
+    points = measure_family(family, scene, repeats=REPEATS, select=attrgetter("in_scene"))
     settings = {name: name for name in family.methods}
     return evaluate_methods(points, settings, tolerance=family.tolerance(scene))
 
 
-def _is_in_scene(trial: Trial) -> bool:
-    return trial.in_scene
-
-
-def make_stages(
-    scene: Scene, choices: Sequence[Choice], measure: MeasureTracking = measure_tracking
-) -> dict[str, list[StageOption]]:
+def make_stages(scene: Scene, choices: Sequence[Choice]) -> dict[str, list[StageOption]]:
     """Return the methods of each tuned method family, with the errors that they add to the system.
 
     Tracking is measured with the noise of each marker method. Its error at the exposure adds to the
@@ -88,7 +83,7 @@ def make_stages(
     stages: dict[str, list[StageOption]] = {}
     for choice in choices:
         if choice.family == "tracking":
-            stages["tracking"] = _list_tracking(scene, choices, choice, measure)
+            stages["tracking"] = _list_tracking(scene, choices, choice)
         else:
             stages[choice.family] = [
                 _make_option(scene, choices, choice, one) for one in choice.evaluations
@@ -140,9 +135,7 @@ def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
     return max((one for one in found if math.isfinite(one)), default=0.0)
 
 
-def _list_tracking(
-    scene: Scene, choices: Sequence[Choice], tracking: Choice, measure: MeasureTracking
-) -> list[StageOption]:
+def _list_tracking(scene: Scene, choices: Sequence[Choice], tracking: Choice) -> list[StageOption]:
     marker = find_choice(choices, "marker")
     if marker is None:
         return [_make_tracking(scene, one, {}) for one in tracking.evaluations]
@@ -151,7 +144,7 @@ def _list_tracking(
         if not math.isfinite(source.error):
             continue
         known = source.method == marker.chosen.method
-        evaluations = tracking.evaluations if known else measure(scene, source.error)
+        evaluations = tracking.evaluations if known else measure_tracking(scene, source.error)
         found += [_make_tracking(scene, one, {"marker": source.method}) for one in evaluations]
     return found
 
@@ -160,7 +153,7 @@ def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]
     horizons = [point.case[HORIZON_MS] for point in one.points]
     first, last = min(horizons), max(horizons)
     fingertip, sheet = (
-        P95_OVER_RMS * _largest([p for p in one.points if p.case[HORIZON_MS] == horizon], _error)
+        P95_OVER_RMS * _largest([p for p in one.points if p.case[HORIZON_MS] == horizon], ERROR)
         for horizon in (first, last)
     )
     took_ms = 1e3 * one.median_s
@@ -179,12 +172,8 @@ def _outside(one: MethodEvaluation) -> float:
     return len(one.outside) / one.cases if math.isfinite(one.error) else 1.0
 
 
-def _error(point: Point) -> float:
-    return point.error
-
-
 def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> list[Choice]:
-    """Return the choices with the chosen method of each family replaced by the one in `methods`."""
+    """Return the choices with the methods in `methods`, by family."""
     return [
         replace(
             choice,
@@ -212,7 +201,6 @@ def tune_system(
     *,
     margin: float,
     runs: int,
-    measure: MeasureTracking = measure_tracking,
 ) -> tuple[Composition, list[Choice]]:
     """Find the cheapest combination of measured methods that meets the tolerances of the system.
 
@@ -222,7 +210,7 @@ def tune_system(
     """
     scene = load_scene(scene_file)
     progress("measuring the tracking with the noise of each marker method")
-    stages = make_stages(scene, choices, measure)
+    stages = make_stages(scene, choices)
 
     def run_graph(combination: Combination) -> Figures:
         chosen = choose_methods(choices, name_methods(combination))

@@ -57,13 +57,11 @@ def load_arm_models(document: Document) -> None:
 
     Raises BadInputError if a reference or a URDF file is invalid.
     """
-    arms = document.values.get("arms")
     for side in ("left", "right"):
-        arm = arms.get(side) if isinstance(arms, dict) else None
-        model = arm.get("model") if isinstance(arm, dict) else None
-        if not (isinstance(arm, dict) and isinstance(model, dict) and "urdf" in model):
-            continue
         at = ("arms", side, "model")
+        model = document.find(at)
+        if not (isinstance(model, dict) and "urdf" in model):
+            continue
         given = validate(UrdfArm, document, at=at)
         try:
             chain = read_urdf(
@@ -71,13 +69,13 @@ def load_arm_models(document: Document) -> None:
             )
         except UrdfError as error:
             raise document.error((*at, "urdf"), f'"{given.urdf}": {error}', error.remedy) from error
-        arm["model"] = chain.model_dump()
+        document.values["arms"][side]["model"] = chain.model_dump()
 
 
 def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
     """Read the chain of six rotary joints between two links of a URDF file.
 
-    start_rad: joint angles at which the arm reaches towards the sheet. Raises UrdfError if the file
+    start_rad: joint angles of an arm that reaches towards the sheet. Raises UrdfError if the file
     does not describe such a chain.
     """
     joints = {joint.child: joint for joint in _load_joints(path)}

@@ -79,7 +79,7 @@ def make_scene(document: Document) -> Scene:
 
     Raises BadInputError if the scene file or a file in it is invalid.
     """
-    name = _find_shape_name(document)
+    name = document.find((*GEOMETRY, "shape"))
     if name is not None and name not in SHAPE_NAMES:
         what = f'unknown shape "{name}"'
         raise document.error((*GEOMETRY, "shape"), what, did_you_mean(name, SHAPE_NAMES))
@@ -94,14 +94,6 @@ def make_scene(document: Document) -> Scene:
     load_image(document)
     load_arm_models(document)
     return validate(Scene, document)
-
-
-def _find_shape_name(document: Document) -> Any:
-    """Return the name of the object's shape in a scene file; None if the file contains no shape."""
-    value: Any = document.values
-    for key in (*GEOMETRY, "shape"):
-        value = value.get(key) if isinstance(value, dict) else None
-    return value
 
 
 def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> Mesh:

@@ -11,7 +11,6 @@ other hosts need no file.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +37,7 @@ def load_image(document: Document) -> None:
 
     Raises BadInputError if the file cannot be used.
     """
-    value: Any = document.values
-    for key in APPEARANCE:
-        value = value.get(key) if isinstance(value, dict) else None
+    value = document.find(APPEARANCE)
     if not isinstance(value, dict) or IMAGE_FILE not in value:
         return
     name, where = value.pop(IMAGE_FILE), (*APPEARANCE, IMAGE_FILE)

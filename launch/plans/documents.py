@@ -153,7 +153,7 @@ class Document:
         return str(self.path)
 
     def folder(self, key: Key) -> Path:
-        """Return the folder to which a relative path in the value of `key` refers.
+        """Return the base folder of a relative path in the value of `key`.
 
         It is the folder of the file that contains `key`. For a value that a command-line option
         overrides, it is the current folder.
@@ -162,6 +162,13 @@ class Document:
             return Path.cwd()
         known = (key[:length] for length in range(len(key), 0, -1) if key[:length] in self.lines)
         return self.extended.get(next(known, ()), self.path).parent
+
+    def find(self, key: Key) -> Any:
+        """Return the value at `key`; return None if the key or one of its parents is missing."""
+        value: Any = self.values
+        for part in key:
+            value = value.get(part) if isinstance(value, dict) else None
+        return value
 
     def extend(self, base: Document, levels: int) -> None:
         """Inherit the values of the document `base` that this document does not contain.
@@ -185,8 +192,7 @@ class Document:
         return Problem(self.where(key), key, what, remedy)
 
     def report(self, key: Key, what: str, remedy: str = "") -> None:
-        """Store a problem at `key`, so that `raise_problems` raises it together with other
-        problems."""
+        """Store a problem at `key` for `raise_problems`, which raises all stored problems."""
         self.problems.append(self.problem(key, what, remedy))
 
     def error(self, key: Key, what: str, remedy: str = "") -> BadInputError:
@@ -405,8 +411,7 @@ def _name_type(value: Any) -> str:
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """Return a remedy for an unknown name, which suggests the most similar name or all known
-    names."""
+    """Return a text that suggests the most similar known name, or else all known names."""
     near = get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
@@ -465,8 +470,7 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 def _existing_part(document: Document, key: Key) -> Key:
     """Return the longest prefix of `key` that exists in the document.
 
-    The error location of pydantic may also contain the name of a type, which is not a key of the
-    file.
+    The error location of pydantic may also contain the name of a type.
     """
     values: Any = document.values
     for number, part in enumerate(key):
@@ -499,8 +503,8 @@ def _walk(model: Any, location: Key) -> tuple[Key, Any]:
     """Convert the location of a pydantic error into a key of the file; also return the value's
     type.
 
-    In a union of models, the location also contains the name of the chosen model, which is not a
-    key of the file.
+    In a union of models, the location also contains the name of the chosen model. This name is not
+    a key of the file.
     """
     key: list[str | int] = []
     for part in location:

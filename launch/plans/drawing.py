@@ -128,8 +128,7 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign columns to nodes, so that each node is to the right of all nodes whose topics it
-    reads.
+    """Assign a column to each node, to the right of all nodes that write its inputs.
 
     links: pairs (writer, reader). Cycles are ignored.
     """
@@ -214,8 +213,7 @@ def mermaid(plan: ResolvedGraph) -> str:
 
 
 def text_lines(plan: ResolvedGraph) -> Iterator[str]:
-    """Yield text lines that list the nodes of each host, with their topics and the readers of
-    these."""
+    """Yield text lines with the nodes of each host, their topics, and the readers of the topics."""
     links = list_links(plan)
     for host, address in plan.hosts.items():
         yield f"{host} ({address})"

@@ -47,7 +47,7 @@ from flexsheet.launch.plans.plan_model import (
 )
 from flexsheet.launch.plans.processes import check_processes
 from flexsheet.launch.plans.resolve_nodes import (
-    CALIBRATION_MARKS,
+    CALIBRATION_CHECKS,
     NodeEntry,
     check_calibrations,
     check_device_hosts,
@@ -84,7 +84,7 @@ def load_graph(
     file. record: bag file to write, which overrides the recorder's setting in the launch file.
     console: whether to add a console and a paused recorder, unless the file contains them.
     apparatus: true parameters of the simulated hardware, as a file or "seed:N"; None uses the
-    scene's values. needed: topics that the caller reads, whose writers are therefore started.
+    scene's values. needed: topics that the caller reads; their writers are started.
     without: parts of the display that are omitted.
 
     Raises BadInputError with all errors of the file.
@@ -222,7 +222,7 @@ def _make_node(
         device_files=_device_files(entry.parameters),
         calibrations={
             ".".join(map(str, key)): str(_value_at(parameters, key))
-            for mark in CALIBRATION_MARKS
+            for mark in CALIBRATION_CHECKS
             for key in find_marked(entry.parameters, mark)
         },
         role=find_role(entry.type),

@@ -98,10 +98,9 @@ class Writer(StrictModel):
         return self.tcp
 
     def source_for(self, host: str) -> Source:
-        """Return the writer's name, and the endpoint to which a subscriber on `host` connects.
+        """Return the writer's name and endpoint for a subscriber on `host`.
 
-        The source of a TCP connection also names the writer's host, so that the subscriber can
-        authenticate this host.
+        The source of a TCP connection also names the writer's host for authentication.
         """
         far = host != self.host and self.tcp is not None
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
@@ -117,7 +116,7 @@ class ResolvedPort(StrictModel):
 
 
 class ResolvedNode(StrictModel):
-    """The complete settings of a node, with which it is started."""
+    """The complete settings of a node for its start."""
 
     name: str
     type: str
@@ -148,7 +147,8 @@ class ResolvedNode(StrictModel):
 
     @property
     def arm_side(self) -> str | None:
-        """Return the side of the arm whose state the node publishes: "left", "right" or None."""
+        """Return "left" or "right" if the node publishes the state of an arm; otherwise return
+        None."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
 
@@ -177,7 +177,7 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """A process and its nodes, which share niceness, restart policy and heartbeat timeout."""
+    """A process and its nodes, with common niceness, restart policy and heartbeat timeout."""
 
     name: str
     nodes: tuple[ResolvedNode, ...]
@@ -228,12 +228,8 @@ class ResolvedGraph(StrictModel):
         """Return the writer `name` of a topic; None if this name may not write the topic."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
-    def endpoints_to_read(self, topic: str) -> tuple[str, ...]:
-        """Return the endpoints to which a subscriber of a topic on the main host connects."""
-        return tuple(writer.endpoint_for(MAIN) for writer in self.writers.get(topic, ()))
-
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
-        """Return the writers and endpoints to which a subscriber of `topic` on `host` connects."""
+        """Return the writers and endpoints of a topic for a subscriber on `host`."""
         return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
 
     def may_reset_estop(self) -> tuple[str, ...]:
@@ -249,7 +245,7 @@ class ResolvedGraph(StrictModel):
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
     def nodes_of_type(self, node_type: str) -> list[ResolvedNode]:
-        """Return the nodes whose class is that of `node_type`, or is derived from it."""
+        """Return the nodes of a type and of its subclasses."""
         base = node_class(node_type)
         return [one for one in self.nodes.values() if issubclass(node_class(one.type), base)]
 
@@ -268,7 +264,7 @@ class ResolvedGraph(StrictModel):
         return [ResolvedProcess(name, tuple(nodes)) for name, nodes in members.items()]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
-        """Return the pairs (node, TCP port) of all ports on which the nodes of a host listen."""
+        """Return (node name, TCP port) for each listening port of the nodes of a host."""
         return [(node.name, port) for node in self.nodes_on(host) for port in node.listen_ports]
 
     def scene_message(self) -> Scene | None:
@@ -279,5 +275,5 @@ class ResolvedGraph(StrictModel):
 
 
 def tools_on(host: str) -> str:
-    """Return the name under which command-line tools on a host publish messages."""
+    """Return the writer name of command-line tools on a host."""
     return TOOLS if host == MAIN else f"{TOOLS}_{host}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -56,15 +56,14 @@ class NodeEntry:
         self.further_inputs: list[Topic] = []
 
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
-        """Return (port name, topic) for all connected ports of a direction, which is input or
-        output."""
+        """Return (port name, topic) of all connected ports of a direction ("input" or "output")."""
         found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
         if direction == "input":
             found += [(further_port(topic.name), topic) for topic in self.further_inputs]
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs whose topic has no writer.
+        """Disconnect optional inputs without a writer.
 
         Inputs that the launch file names explicitly stay connected. written: names of the topics
         that have a writer.
@@ -78,8 +77,7 @@ class NodeEntry:
         )
 
     def disconnect(self, ports: Iterable[str]) -> None:
-        """Disconnect the named ports; ports to which the launch file assigns a topic stay
-        connected."""
+        """Disconnect the named ports, except for ports with a topic in the launch file."""
         names = set(ports) - self.spec.topics.keys()
         for port, topic in [*self.ports]:
             if port.name in names:
@@ -87,7 +85,7 @@ class NodeEntry:
                 self.unconnected.append((port, topic))
 
     def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
-        """Return the unconnected ports of a direction, which is input or output."""
+        """Return the unconnected ports of a direction ("input" or "output")."""
         return tuple(
             ResolvedPort(port=port.name, topic=topic.name, endpoints=())
             for port, topic in self.unconnected
@@ -265,41 +263,35 @@ def check_device_hosts(entries: list[NodeEntry], spec: LaunchFile, document: Doc
                 )
 
 
-CALIBRATION_MARKS = (
-    ParameterMark.CAMERA_CALIBRATION,
-    ParameterMark.SHEET_CALIBRATION,
-    ParameterMark.MARKER_CALIBRATION,
-)
+CALIBRATION_CHECKS: dict[
+    ParameterMark, tuple[Callable[[Path], Any], Callable[[Any, Scene], None]]
+] = {
+    ParameterMark.CAMERA_CALIBRATION: (
+        load_calibration,
+        lambda measured, scene: refuse_other_camera(measured, scene.camera),
+    ),
+    ParameterMark.SHEET_CALIBRATION: (
+        load_sheet_calibration,
+        lambda measured, scene: refuse_other_sheet(measured, scene.sheet),
+    ),
+    ParameterMark.MARKER_CALIBRATION: (load_marker_calibration, refuse_other_marker),
+}
+"""The functions that load a calibration file, and that refuse a file for another scene."""
 
 
 def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: Document) -> None:
     """Report a problem if a calibration file in a node's parameters is invalid or unfit for the
     scene."""
-
-    def check_camera(path: Path) -> None:
-        measured = load_calibration(path)
-        if scene is not None:
-            refuse_other_camera(measured, scene.camera)
-
-    def check_sheet(path: Path) -> None:
-        measured = load_sheet_calibration(path)
-        if scene is not None:
-            refuse_other_sheet(measured, scene.sheet)
-
-    def check_marker(path: Path) -> None:
-        measured = load_marker_calibration(path)
-        if scene is not None:
-            refuse_other_marker(measured, scene)
-
-    checks = zip(CALIBRATION_MARKS, (check_camera, check_sheet, check_marker), strict=True)
-    for entry, (mark, check) in product(entries, checks):
+    for entry, (mark, (load, refuse)) in product(entries, CALIBRATION_CHECKS.items()):
         if entry.parameters is None:
             continue
         for marked, calibration in find_marked(entry.parameters, mark).items():
             key = (*entry.key, "parameters", *marked)
             path = Path(_absolute(calibration, document.folder(key)))
             try:
-                check(path)
+                measured = load(path)
+                if scene is not None:
+                    refuse(measured, scene)
             except CalibrationFileError as error:
                 document.report(key, str(error))
             except CalibrationMismatchError as error:
@@ -326,7 +318,7 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
     """Return the JSON form of a parameter value with absolute instead of relative paths.
 
-    value: parameter value. dumped: its JSON form. base: folder to which relative paths refer.
+    value: parameter value. dumped: its JSON form. base: base folder of relative paths.
     """
     if isinstance(value, Path):
         return _absolute(value, base)

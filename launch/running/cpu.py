@@ -63,7 +63,7 @@ class CpuWatch:
         The waiting time is measured over the last WINDOW_S. Returns None if no waiting time is
         known.
 
-        watched: process ids by node name, of the nodes whose waiting time is measured. named:
+        watched: process ids of the measured nodes by node name. named:
         process ids by node name, of the nodes that are reported by name; None: `watched`.
         measure_programs: whether to list the running programs even if the computer is not
         overloaded.

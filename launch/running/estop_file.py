@@ -48,7 +48,7 @@ class EStopFile:
         return EStop(engaged=True, reason=str(reason))
 
     def write(self, estop: EStop) -> None:
-        """Store the e-stop so that it survives a power failure; raise OSError if this fails."""
+        """Store the e-stop durably against a power failure; raise OSError if this fails."""
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")
         with part.open("w") as file:

@@ -22,6 +22,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import IO
@@ -67,7 +68,7 @@ class ForkedProcess:
 
 
 class ForkServer:
-    """The launcher's connection to a fork server, whose process the constructor starts.
+    """The launcher's connection to a fork server. The constructor starts the server.
 
     node_types: types of the nodes. Modules of types outside this package are not imported, since
     they may start threads. config_files: files of all processes that may be started. lifeline: file
@@ -147,17 +148,13 @@ class ForkServer:
         except OSError:
             # The fork server has ended, but it may have reported a process before.
             self._end()
-            answer = self._read_last_answer()
+            answer = b""
+            with suppress(OSError):
+                answer = self._socket.recv(PID_BYTES, socket.MSG_DONTWAIT)
         if len(answer) < PID_BYTES:
             self.close()
             return None
         return ForkedProcess(int.from_bytes(answer, "little"))
-
-    def _read_last_answer(self) -> bytes:
-        try:
-            return self._socket.recv(PID_BYTES, socket.MSG_DONTWAIT)
-        except OSError:
-            return b""
 
     def _end(self) -> None:
         self._process.kill()
@@ -230,7 +227,7 @@ def _import_nodes(types: Iterable[str]) -> None:
 
 
 def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
-    """Fork a process whose parent is the launcher.
+    """Fork a process, and make the launcher its parent.
 
     Returns True in the new process, and False in the fork server. The new process ends if the
     launcher has not received its process id. descriptors: files that the process inherits.
@@ -266,8 +263,7 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
 
 
 def _write_arguments(arguments: list[str]) -> None:
-    """Replace the arguments of this process in /proc, from which tools identify the nodes'
-    processes.
+    """Replace the arguments of this process in /proc, because tools identify nodes by them.
 
     The remaining space is filled by an argument of spaces before the last two arguments. Raises
     ValueError if the space is too small.

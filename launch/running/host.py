@@ -24,10 +24,11 @@ from flexsheet.launch.plans.plan_model import ArmingMode, ResolvedGraph, Resolve
 from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
 from flexsheet.launch.running.priority import list_denied
+from flexsheet.launch.running.runs import Run, local_endpoints, local_sources
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Handler, Publisher, Source, Subscriber
 from flexsheet.messages.busy import describe_busy, describe_busy_remedy, is_busy
-from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.clock import Clock, SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyChange, KeyRing
@@ -41,7 +42,7 @@ from flexsheet.messages.types import (
     NodeProcess,
 )
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.node import PortCounts
+from flexsheet.nodes.node import Output, PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
@@ -56,17 +57,13 @@ ARMS = ("arm_left", "arm_right")
 
 Processes = Callable[[], tuple[NodeProcess, ...]]
 Pids = Callable[[], dict[str, int]]
-Endpoints = Callable[[tuple[str, ...]], tuple[str, ...]]
-Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
 class HostAgent:
     """A part of the launcher that publishes the status of its host and latches e-stops.
 
-    The agent works between the calls of `start` and `close`. endpoints, sources: functions that
-    replace the placeholder of the run's directory. code: git commit that `HostStatus` reports.
-    run_directory: folder for the socket that receives e-stops; None for no socket. pids: function
-    that returns the process ids of the running nodes by node name.
+    The agent works between the calls of `start` and `close`. code: git commit that `HostStatus`
+    reports. pids: function that returns the process ids of the running nodes by node name.
     """
 
     def __init__(
@@ -74,35 +71,34 @@ class HostAgent:
         plan: ResolvedGraph,
         host: str,
         *,
-        run_id: str,
+        run: Run,
         code: str,
         processes: Processes,
         pids: Pids,
-        endpoints: Endpoints,
-        sources: Sources,
         keys: KeyRing | None,
         on_problem: Callable[[str], None],
-        run_directory: Path | None = None,
     ) -> None:
-        self._plan, self._host, self._run_id, self._code = plan, host, run_id, code
+        self._plan, self._host, self._run, self._code = plan, host, run, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
         self._pids, self._cpu = pids, CpuWatch()
         self._was_busy, self._busy_reported_ns = False, 0
-        self._sources = sources
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
         # Launchers repeat the e-stop, so a restarted launcher gets it from the other launchers.
         self._launchers = {launcher_on(name) for name in plan.hosts}
-        self._sequence = {"host": 0, "estop": 0}
         self.publishers: dict[str, Publisher] = {}
-        for topic in self._sequence:
+        self._outputs: dict[str, Output[Message]] = {}
+        for topic in ("host", "estop"):
             writer = plan.writer(topic, self._name)
             if writer is not None:
-                self.publishers[topic] = Publisher(
+                self.publishers[topic] = publisher = Publisher(
                     find_topic(topic),
-                    endpoints(writer.endpoints),
+                    local_endpoints(run, writer.endpoints),
                     keys=keys,
                     on_refused=on_problem,
+                )
+                self._outputs[topic] = make_output(
+                    publisher, self._clock, writer=self._name, epoch=self._epoch, plan=plan.hash
                 )
         self._clock_table = ClockTable(self._clock.id)
         self._subscribers: list[Subscriber] = []
@@ -111,11 +107,7 @@ class HostAgent:
         self._engaged_ns = 0
         self._resetting: asyncio.Task[None] | None = None
         self._file = EStopFile(host, list_arms(plan)) if has_manual_arming(plan) else None
-        self._stop_socket = (
-            None
-            if run_directory is None
-            else StopSocket(run_directory, "launcher", self._name, self._stop)
-        )
+        self._stop_socket = StopSocket(run.directory, "launcher", self._name, self._stop)
         self._file_outdated = False
         self._status_error = ""
         nodes = plan.nodes_on(host)
@@ -125,8 +117,7 @@ class HostAgent:
 
     def start(self) -> None:
         """Subscribe to e-stops and start to publish; this requires a running event loop."""
-        if self._stop_socket is not None:
-            self._stop_socket.open()
+        self._stop_socket.open()
         stored = None if self._file is None else self._file.read()
         if stored is not None:
             self._on_problem(
@@ -153,7 +144,7 @@ class HostAgent:
     def _subscribe(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
         subscriber = Subscriber(
             find_topic(topic),
-            self._sources(sources),
+            local_sources(self._run, sources),
             handler,
             PortCounts(),
             on_problem=self._on_problem,
@@ -172,8 +163,7 @@ class HostAgent:
 
     async def close(self) -> None:
         """Stop publishing and close all sockets; further calls have no effect."""
-        if self._stop_socket is not None:
-            self._stop_socket.close()
+        self._stop_socket.close()
         for task in (self._task, self._resetting):
             if task is not None:
                 task.cancel()
@@ -280,20 +270,8 @@ class HostAgent:
             self._file_outdated = False
 
     def _publish(self, topic: str, message: Message) -> None:
-        if topic not in self.publishers:
-            return
-        self._sequence[topic] += 1
-        now_ns = self._clock.now_ns()
-        header = Header(
-            sequence=self._sequence[topic],
-            source_ns=now_ns,
-            publish_ns=now_ns,
-            clock_id=self._clock.id,
-            writer=self._name,
-            epoch=self._epoch,
-            plan=self._plan.hash,
-        )
-        self.publishers[topic].send(message, header)
+        if topic in self._outputs:
+            self._outputs[topic].publish(message)
 
     async def _publish_loop(self) -> None:
         while True:
@@ -330,7 +308,7 @@ class HostAgent:
         }
         return HostStatus(
             host=self._host,
-            run=self._run_id,
+            run=self._run.id,
             plan_hash=self._plan.hash,
             code=self._code,
             python=python_version(),
@@ -353,6 +331,20 @@ class HostAgent:
             cpu=self._cpu.update(watched, pids),
             nice_denied=self._nice_denied,
         )
+
+
+def make_output(
+    publisher: Publisher, clock: Clock, *, writer: str, epoch: int, plan: str
+) -> Output[Message]:
+    """Return an output that numbers and timestamps the messages of a publisher."""
+    return Output(
+        publisher.topic,
+        clock,
+        lambda _, message, header: publisher.send(message, header),
+        writer=writer,
+        epoch=epoch,
+        plan=plan,
+    )
 
 
 def has_estop(state: ArmState) -> bool:

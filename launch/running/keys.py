@@ -42,7 +42,7 @@ def secret_file(host: str) -> Path:
 def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
     """Write the key ring files of a run, load them, and return the key rings by host.
 
-    host: host whose file is written; None for all hosts. Raises BadInputError if a key is missing
+    host: host of the key ring file; None for all hosts. Raises BadInputError if a key is missing
     or invalid.
     """
     rings = {}
@@ -62,8 +62,8 @@ def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Key
 class KeyWatch:
     """A monitor that detects key changes during a run.
 
-    It reads the launch file and the secret key files, and writes changes to the key ring files,
-    which the processes of the run read.
+    The monitor reads the launch file and the secret key files, and updates the key ring files of
+    the run's processes.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, rings: dict[str, KeyRing]) -> None:
@@ -94,8 +94,8 @@ def install(launch_file: Path, host: str, key: str) -> None:
     Raises BadInputError if the launch file does not contain the host, or if the key is invalid.
     """
     document = read_document(launch_file)
-    hosts = document.values.get("hosts")
-    if not isinstance(hosts, dict) or not isinstance(hosts.get(host), dict):
+    if not isinstance(document.find(("hosts", host)), dict):
+        hosts = document.find(("hosts",))
         names = list(hosts) if isinstance(hosts, dict) else []
         raise document.error(("hosts",), f'there is no host "{host}"', did_you_mean(host, names))
     if not is_key(key):

@@ -15,7 +15,7 @@ CAP_SYS_NICE = 23
 
 
 def min_nice_step() -> int:
-    """Return the minimum value by which this process may change the niceness of a child process."""
+    """Return the lowest change of niceness that is permitted for a child process."""
     own = os.getpriority(os.PRIO_PROCESS, 0)
     # The limit RLIMIT_NICE is 20 minus the minimum niceness: 25 permits a niceness of -5.
     soft_limit, _ = resource.getrlimit(resource.RLIMIT_NICE)
@@ -36,14 +36,13 @@ def min_node_nice() -> int:
 
 
 def list_denied(nodes: Sequence[ResolvedNode]) -> list[str]:
-    """Return the names of the nodes whose configured niceness is not permitted."""
+    """Return the names of the nodes with a niceness that is not permitted."""
     minimum = min_node_nice()
     return [node.name for node in nodes if node.nice < minimum]
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Return a text about nodes whose niceness is not permitted; None if there are no such
-    nodes."""
+    """Return a text about nodes with a niceness that is not permitted; None if there are none."""
     names = list_denied(nodes)
     if not names:
         return None

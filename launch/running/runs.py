@@ -67,7 +67,7 @@ class Run:
 
     @property
     def host(self) -> str | None:
-        """Return the host whose nodes the run started; None if it started all nodes."""
+        """Return the host of the started nodes; None if the run started all nodes."""
         try:
             return (self.directory / HOST_FILE).read_text()
         except FileNotFoundError:
@@ -85,7 +85,7 @@ class Run:
 
 
 def ring_file(run: Run, host: str) -> Path:
-    """Return the file from which the processes of a host read their keys."""
+    """Return the key ring file of a host's processes."""
     return run.directory / f"keys-{host}.json"
 
 
@@ -114,7 +114,7 @@ def root() -> Path:
 
 
 def create_run() -> Run:
-    """Create the directory of a new run, which other users cannot read.
+    """Create the private directory of a new run.
 
     Raises RunDirectoryError if the folder of all runs cannot be used.
     """
@@ -140,7 +140,7 @@ def create_run() -> Run:
 
 
 def list_runs() -> list[Run]:
-    """Return all runs whose directory exists, in descending order of their start time."""
+    """Return all stored runs, newest first."""
     if not root().is_dir():
         return []
     runs = [
@@ -152,7 +152,7 @@ def list_runs() -> list[Run]:
 
 
 def list_live_runs() -> list[Run]:
-    """Return the runs whose launcher is alive, in descending order of their start time."""
+    """Return the runs with a live launcher, newest first."""
     return [run for run in list_runs() if run.is_alive()]
 
 
@@ -167,7 +167,7 @@ def launcher_is_alive(run_id: str) -> bool:
 
 
 def find_orphans() -> list[psutil.Process]:
-    """Return this user's processes that belong to runs whose launcher has exited."""
+    """Return this user's processes that exited launchers have left over."""
     import psutil
 
     found = []

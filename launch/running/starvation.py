@@ -13,8 +13,8 @@ RUNNABLE = "R"
 class ProcessorTime:
     """The kernel counters of the main thread of a process since its start.
 
-    run_s: time on a processor core. wait_s: time in which the thread was ready to run but had no
-    core, counted until the thread last ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
+    run_s: time on a processor core. wait_s: time that the thread waited for a core, until the
+    thread last ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float
@@ -44,7 +44,7 @@ def compute_starved_s(
     """Return the time (s) that a process waited for a processor core between two readings.
 
     The result is at most `elapsed_s`. The kernel adds a wait to its counter only when the wait
-    ends. If the process is still ready to run, all time in which it did not run counts as a wait.
+    ends. If the process is still waiting, all time without a core counts as a wait.
     """
     if before is None or now is None:
         return 0.0

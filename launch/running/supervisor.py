@@ -42,7 +42,7 @@ from flexsheet.launch.plans.plan_model import (
 from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.launch.running.fork_server import NODE_ARGUMENTS, ForkServer
-from flexsheet.launch.running.host import HostAgent
+from flexsheet.launch.running.host import HostAgent, make_output
 from flexsheet.launch.running.keys import KeyWatch, make_rings
 from flexsheet.launch.running.priority import describe_nice_problem, min_nice_step
 from flexsheet.launch.running.runs import (
@@ -57,7 +57,7 @@ from flexsheet.launch.running.runs import (
     sweep,
 )
 from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
-from flexsheet.messages.base import Header, Message
+from flexsheet.messages.base import Message
 from flexsheet.messages.bus import Publisher
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.errors import FlexsheetError
@@ -68,6 +68,7 @@ from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
 from flexsheet.nodes import NodeRole
+from flexsheet.nodes.node import Output
 from flexsheet.nodes.runner import NodeConfig, PortConfig, ProcessConfig
 
 SOFTWARE = Path(__file__).resolve().parents[2]
@@ -164,7 +165,7 @@ class Child:
             os.killpg(self.pid, number)
 
     def kill_now(self) -> None:
-        """Kill and reap the process without the event loop, which may already be closing."""
+        """Kill and reap the process without the event loop, because the loop may be closing."""
         self.signal(signal.SIGKILL)
         if not self.exited.done():
             self._process.wait()
@@ -182,9 +183,9 @@ class Child:
         """Wait until the process has sent no heartbeat for `seconds`.
 
         The silence is the number of the launcher's polls times their period. Clock time is not
-        used, because a suspended launcher would receive no heartbeats either. Time in which the
-        process waited for a processor core does not count. If only this subtraction prevents the
-        timeout, `on_starved` is called once with the subtracted time (s).
+        used, because a suspended launcher would receive no heartbeats either. Waiting time for a
+        processor core does not count. If only this subtraction prevents the timeout, `on_starved`
+        is called once with the subtracted time (s).
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)
@@ -269,7 +270,7 @@ class Child:
         self.exited.set_result(self._process.wait())
 
     def _reap_group(self, tries: int) -> None:
-        """Reap the killed child processes of a node, of which the launcher is now the parent.
+        """Reap the killed child processes of a node. The launcher has become their parent.
 
         tries: maximum number of further attempts.
         """
@@ -305,7 +306,7 @@ def _start_python(
 class RunningGraph:
     """A supervisor of the processes that run the nodes of a graph.
 
-    host: host whose nodes are started; None starts all nodes on this computer. without: names of
+    host: host of the nodes to start; None starts all nodes on this computer. without: names of
     nodes that are not started. report: function that is called with (node, line) for every log
     line. The folder `run.logs` also contains all lines.
     """
@@ -330,7 +331,7 @@ class RunningGraph:
         self._supervisors: dict[str, asyncio.Task[None]] = {}
         self._ready = {node.name: asyncio.Event() for node in self.nodes}
         self._publishers: dict[str, Publisher] = {}
-        self._sequences: dict[str, int] = {}
+        self._outputs: dict[str, Output[Message]] = {}
         self._epoch_ns = 0
         self._agents: dict[str, HostAgent] = {}
         self._rings: dict[str, KeyRing] = {}
@@ -447,7 +448,7 @@ class RunningGraph:
             child.signal(number)
 
     def _list_open_bags(self, children: Collection[Child]) -> list[Path]:
-        """Return the bag files to which recorders in the given processes are writing."""
+        """Return the bag files that recorders in the given processes have open."""
         pids = {child.pid for child in children}
         recorders = {one.name for one in self.nodes if one.role is NodeRole.RECORDER}
         return [
@@ -491,8 +492,8 @@ class RunningGraph:
     async def _end_children(self) -> None:
         """End all processes.
 
-        Simulated arms end after their bridges, which send them stop commands. Nodes that only read
-        topics end last, so that they receive the final messages.
+        Simulated arms end after their bridges, because bridges send stop commands to them. Nodes
+        that only read topics end last, to receive the final messages.
         """
         readers = {
             name
@@ -564,45 +565,31 @@ class RunningGraph:
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:
             return None
-        clock = SystemClock()
-        now_ns = clock.now_ns()
-        if topic not in self._publishers:
-            self._publishers[topic] = Publisher(
+        if topic not in self._outputs:
+            self._publishers[topic] = publisher = Publisher(
                 find_topic(topic),
                 local_endpoints(self.run, writer.endpoints),
                 keys=self._rings.get(MAIN),
                 on_refused=partial(self._report, LAUNCHER),
             )
-            self._epoch_ns = self._epoch_ns or now_ns
-        self._sequences[topic] = self._sequences.get(topic, 0) + 1
-        self._publishers[topic].send(
-            message,
-            Header(
-                sequence=self._sequences[topic],
-                source_ns=now_ns,
-                publish_ns=now_ns,
-                clock_id=clock.id,
-                writer=LAUNCHER,
-                epoch=self._epoch_ns,
-                plan=self.plan.hash,
-            ),
-        )
-        return now_ns
+            clock = SystemClock()
+            self._epoch_ns = self._epoch_ns or clock.now_ns()
+            self._outputs[topic] = make_output(
+                publisher, clock, writer=LAUNCHER, epoch=self._epoch_ns, plan=self.plan.hash
+            )
+        return self._outputs[topic].publish(message).source_ns
 
     def _start_agent(self, host: str) -> None:
         git = json.loads((self.run.directory / "git.json").read_text())
         agent = HostAgent(
             self.plan,
             host,
-            run_id=self.run.id,
+            run=self.run,
             code=f"{(git['commit'] or 'unknown')[:12]}{'+' if git['changed'] else ''}",
             processes=partial(self._list_states, host),
             pids=lambda: self.pids,
-            endpoints=partial(local_endpoints, self.run),
-            sources=partial(local_sources, self.run),
             keys=self._rings.get(host),
             on_problem=partial(self._report, LAUNCHER),
-            run_directory=self.run.directory,
         )
         self._agents[host] = agent
         agent.start()
@@ -708,8 +695,8 @@ class RunningGraph:
     async def _is_late(self, child: Child, process: ResolvedProcess) -> bool:
         """Wait until a process is ready, exits, or exceeds its start deadline.
 
-        Returns whether the process exceeded the deadline. Time in which it waited for a processor
-        core does not count.
+        Returns whether the process exceeded the deadline. Waiting time for a processor core does
+        not count.
         """
         on_starved = partial(self._report_starved, f"{process.name} is not ready yet")
         # A process sends its first heartbeat when it is ready.
@@ -805,7 +792,7 @@ class RunningGraph:
             )
 
     def _write_run_files(self) -> None:
-        """Write the files that the recorder stores, and the files by which tools find the graph."""
+        """Write the run's files for the recorder and for command-line tools."""
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
@@ -951,20 +938,16 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
         )
     for name, address in plan.hosts.items():
         if not is_loopback(address) and not plan.keys:
-            raise BadInputError(
-                [
-                    read_launch_file(Path(plan.launch_file)).problem(
-                        ("hosts", name, "address"),
-                        f"{address} is not a loopback address, but the hosts have no keys",
-                        f"create a key on each host (flexsheet keys new {name}) and install all "
-                        f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
-                    )
-                ]
+            raise read_launch_file(Path(plan.launch_file)).error(
+                ("hosts", name, "address"),
+                f"{address} is not a loopback address, but the hosts have no keys",
+                f"create a key on each host (flexsheet keys new {name}) and install all "
+                f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
             )
 
 
 def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
-    """Check that all TCP ports on which this launcher's processes listen are free.
+    """Check that all TCP ports of this launcher's processes are free.
 
     Raises BadInputError if a port is in use.
     """

@@ -37,15 +37,12 @@ class SystemFile:
     mode: int = 0o644
 
 
-def make_files(
-    *, launch_file: Path, host: str, user: str, root: Path, flexsheet: Path | None = None
-) -> Iterator[SystemFile]:
+def make_files(*, launch_file: Path, host: str, user: str, root: Path) -> Iterator[SystemFile]:
     """Yield the systemd unit, the kernel's TCP settings, and the environment file of a host.
 
-    root: root folder of the file system; "/" except in tests. flexsheet: path of the command; None:
-    the command in the folder of this Python interpreter.
+    root: root folder of the file system; "/" except in tests.
     """
-    command = flexsheet or Path(sys.executable).parent / "flexsheet"
+    command = Path(sys.executable).parent / "flexsheet"
     unit = TEMPLATE.read_text()
     replaced = {"@SOFTWARE@": str(SOFTWARE), "@USER@": user, "@FLEXSHEET@": str(command)}
     for key, value in replaced.items():

@@ -39,7 +39,7 @@ class ToolCounts:
 
 
 def tools_host(run: Run) -> str:
-    """Return the name of the host on which command-line tools run."""
+    """Return the host of the command-line tools."""
     return run.host or MAIN
 
 
