@@ -31,7 +31,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import find_parameters_type
-from tests.doc_pages import ROOT, Block, as_built, blocks, code_spans, name, pages, site_pages
+from tests.doc_pages import DOCS, ROOT, Block, as_built, blocks, code_spans, name, pages, site_pages
 from tests.scenes import load_values
 from tests.test_cli_help import parse
 
@@ -39,6 +39,9 @@ LANGUAGES = {"python", "yaml", "bash", "sh", "console", "text"}
 SHELLS = ("bash", "sh", "console")
 BLOCKS = {page: blocks(page) for page in pages()}
 SCENE = ROOT / "launch" / "scenes" / "cylinder.yaml"
+
+TUTORIALS = ("tutorial.md", "tutorial-record.md", "write-your-own-node.md")
+"""The pages whose files the reader saves in the folder `runs` of the clone."""
 
 OURS = {"flexsheet", "make", "python", "pytest"}
 OTHERS = {
@@ -73,6 +76,7 @@ def with_language(*languages: str) -> dict[Path, list[Block]]:
 @pytest.fixture
 def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Create a working folder with the project's launch files and without the user's files."""
+    (tmp_path / "runs").mkdir()
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     for linked in ("scenes", "calibrations"):
         (tmp_path / linked).symlink_to(ROOT / "launch" / linked)
@@ -119,7 +123,8 @@ def test_yaml_blocks_are_valid(block: Block, clone: Path, monkeypatch: pytest.Mo
     values = YAML(typ="safe").load(block.text)
     if block.not_run is None:
         write_modules(block.page, clone, monkeypatch)
-        check_yaml(block.text, values, clone, block.place)
+        folder = clone / "runs" if block.page.name in TUTORIALS else clone
+        check_yaml(block.text, values, folder, block.place)
 
 
 def write_modules(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,6 +227,15 @@ def test_each_call_in_a_block_can_be_made(page: Path) -> None:
     for block in with_language(*SHELLS)[page]:
         for call in commands(block.text):
             check_call(call, written, block.place)
+
+
+@pytest.mark.parametrize("page", TUTORIALS)
+def test_tutorials_write_only_into_the_folder_that_git_ignores(page: str) -> None:
+    assert "runs/" in (ROOT / ".gitignore").read_text().splitlines()
+    calls = [" ".join(call) for block in blocks(DOCS / page) for call in calls_of(block)]
+    texts = [*calls, *(span for _, span in code_spans(DOCS / page))]
+    for file in re.findall(r"[\w./-]+\.(?:csv|html|mcap|png|py|svg|yaml)\b", " ".join(texts)):
+        assert file.startswith("runs/") or (ROOT / file).is_file(), f"{page}: save runs/{file}"
 
 
 @pytest.mark.parametrize("page", pages(), ids=name)
