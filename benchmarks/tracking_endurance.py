@@ -333,12 +333,12 @@ def run(seed: int, count: int) -> Tally:
     return evaluate_sequence(seen, bench_scene(), seed)
 
 
-def endure(frames: int, *, processes: int, first_seed: int = 1) -> Tally:
+def endure(frames: int, *, processes: int) -> Tally:
     """Simulate sequences of SEQUENCE_FRAMES in a pool of processes."""
     counts = [SEQUENCE_FRAMES] * (frames // SEQUENCE_FRAMES)
     if frames % SEQUENCE_FRAMES:
         counts.append(frames % SEQUENCE_FRAMES)
-    seeds = range(first_seed, first_seed + len(counts))
+    seeds = range(1, 1 + len(counts))
     total, began_s = Tally(), time.monotonic()
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=context) as pool:
@@ -359,9 +359,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--first-seed", type=int, default=1)
     given = parser.parse_args()
-    report = endure(given.frames, processes=given.processes, first_seed=given.first_seed).report()
+    report = endure(given.frames, processes=given.processes).report()
     print(json.dumps({"machine": machine_name(), **report}, indent=1))
 
 
