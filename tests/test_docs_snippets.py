@@ -1,9 +1,8 @@
 """Test that the code of the documentation runs.
 
-Python blocks run page by page, each page in one namespace. YAML blocks are validated by their form:
-a launch file, nodes of one, a node's parameters, parts of a scene. In shell blocks, and in code
-within the text, each call of `flexsheet` is parsed; fast ones run. `<!-- not run: why -->` before a
-block limits the test to parsing.
+The Python blocks of a page run in one namespace. YAML blocks are validated as launch files, nodes,
+parameters or parts of a scene. Each call of `flexsheet` in shell blocks and in the text is parsed,
+and fast calls run. A block after the comment `<!-- not run: why -->` is only parsed.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ AT_ONCE = ("--help", "--version", "--install-completion", "--show-completion")
 """Options that act during parsing, also in the reader's home."""
 
 LACKS_SOMETHING = ("MissingParameter", "NoArgsIsHelpError")
-"""Errors of the command line for a command name without its arguments."""
+"""The errors of the command line for a command without arguments."""
 
 CHEAP = (
     "flexsheet node ",
@@ -64,8 +63,10 @@ CHEAP = (
     "flexsheet calibrate board",
     "flexsheet keys new",
 )
-"""Commands to run, in a separate folder. Examples of the generated pages (`sh`) are excluded,
-because they use files that do not exist."""
+"""The beginnings of commands to run in a separate folder.
+
+Examples of generated pages (`sh`) do not run, because the files in the examples do not exist.
+"""
 
 
 def with_language(*languages: str) -> dict[Path, list[Block]]:
@@ -128,7 +129,7 @@ def test_yaml_blocks_are_valid(block: Block, clone: Path, monkeypatch: pytest.Mo
 
 
 def write_modules(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write the page's first Python block to a file if it names one in its first line."""
+    """Write the first Python block of a page to the module files that the page names."""
     first = next(iter(with_language("python").get(page, [])), None)
     if first is not None and first.text.startswith('"""'):
         for named in re.findall(r"(\w+):\w+", page.read_text()):
@@ -169,7 +170,7 @@ def check_nodes(nodes: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """Yield the calls of a block as words, without comments, sudo and variables."""
+    """Yield the words of each call in a block, without comments, sudo and variables."""
     for line in text.replace("\\\n", " ").splitlines():
         line = re.sub(r"^\w+\$ ", "", line)  # noqa: PLW2901  # a prompt of a console
         call: list[str] = []
@@ -192,9 +193,10 @@ def program(call: Sequence[str]) -> list[str]:
 def check_call(
     call: Sequence[str], written: set[str], place: str, *, may_name_only: bool = False
 ) -> None:
-    """Return whether a call can be parsed, or is the name of a command.
+    """Check that a call can be parsed.
 
     written: files that calls of the page have written.
+    may_name_only: whether the call may be the name of a command without arguments.
     """
     match program(call):
         case ["flexsheet" | "/opt/flexsheet/.venv/bin/flexsheet", *rest]:
