@@ -105,11 +105,9 @@ test-long: $(DEV_STAMP) cached
 bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
-	$(BIN)/python -m benchmarks.recovery
-	$(BIN)/python -m benchmarks.scenes --markdown
+	$(BIN)/python -m benchmarks.scenes
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_size --output docs/charts
-	$(BIN)/python -m benchmarks.frame_cpu
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_regret --output docs/charts
@@ -141,9 +139,8 @@ fuzz: setup
 	$(INSTALL) --no-build-isolation -e '.[fuzz]'
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fuzz
 
-# Measure the tables and pictures that docs/limits.md summarizes.
+# Measure the disturbances of the fingertip in docs/limits.md.
 limits: setup $(DEV_STAMP)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
 # Insert figures from docs/results into the pages, and draw docs/images.

@@ -1,25 +1,22 @@
 """Compare the rendered force of soft to stiff objects with the simulator's membrane.
 
-OPENBLAS_NUM_THREADS=1 python -m benchmarks.compliance [--table] [--depth-mm 50]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.compliance
 
-The object is the scene's, with several Young's moduli; its force-depth curve comes from the soft
-body. For each modulus the planner's compliance selects stretch and advance. The simulated sheet
-then gives the force on a finger at each depth. For comparison: a stretch for the object's stiffness
-only, without advance.
+The object of the scene is used with several Young's moduli. The force-depth curve is computed by
+the soft body. For each modulus, the planner selects the stretch and the advance of the sheet, and
+the simulated sheet gives the force on a finger at each depth. A sheet with stretch but without
+advance is measured for comparison.
 
 The program also prints the force errors at other points of the sheet, and the range of moduli that
-the sheet can render. It takes two minutes. With --table, the planner uses a table from finite
-elements of the membrane instead of a formula, which takes half a minute more.
+the sheet can render. It takes two minutes.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
 from flexsheet.launch.health.compliance import (
@@ -29,6 +26,7 @@ from flexsheet.launch.health.compliance import (
 )
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_material
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
@@ -39,13 +37,7 @@ from flexsheet.nodes.planner.compliance import (
     choose_stretch,
     compute_force_uncertainty_ratio,
 )
-from flexsheet.nodes.planner.sheet_force import (
-    compute_membrane_table,
-    make_force_model,
-    make_rubber,
-)
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.planner.sheet_force import make_force_model
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 MODULI_PA = (500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0, 16000.0)
@@ -157,29 +149,14 @@ def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Compare the rendered with the true force.")
-    parser.add_argument("--table", action="store_true", help="use a table of finite elements")
-    parser.add_argument("--depth-mm", type=float, default=50.0, help="maximum depth, mm")
-    asked = parser.parse_args()
     scene = load_scene(SCENE_FILE)
     law = make_force_model(scene.sheet)
-    if asked.table:
-        sheet = scene.sheet
-        law = compute_membrane_table(
-            make_rubber(sheet),
-            stretches=np.linspace(sheet.min_stretch_ratio, sheet.max_stretch_ratio, 3),
-            xs_m=sheet.width_m * np.array([0.0, 0.13, 0.25]),
-            ys_m=sheet.height_m * np.array([0.0, 0.19, 0.36]),
-            finger_radius_m=scene.finger.radius_m,
-        )
-    depths = DEPTHS_M[1e-3 * asked.depth_mm + 1e-9 >= DEPTHS_M]
     print(f"scene {scene.name}, law {law.name}; 0.05 N and more are compared")
-    materials(scene, law, depths)
-    places(scene, law, depths)
+    materials(scene, law, DEPTHS_M)
+    places(scene, law, DEPTHS_M)
     print()
     for deepest in (0.010, 0.020, 0.050):
-        if deepest <= float(depths[-1]) + 1e-9:
-            limits(scene, law, deepest)
+        limits(scene, law, deepest)
 
 
 if __name__ == "__main__":

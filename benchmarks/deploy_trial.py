@@ -136,7 +136,7 @@ class Computer:
         await self.type("set -m")
 
     async def type(self, command: str) -> tuple[int, str]:
-        """Run a command; return its exit code and output."""
+        """Run a command, and return its exit code and output."""
         assert self._shell.stdin is not None
         assert self._shell.stdout is not None
         self._shell.stdin.write(f"{command}\nprintf '\\001%d\\n' $?\n".encode())
@@ -150,7 +150,10 @@ class Computer:
         raise RuntimeError(f"the shell of {self.name} has ended: {''.join(words)}")
 
     async def follow(self, command: str) -> tuple[int, str]:
-        """Run a command of the page; run a launch in the background, and wait until it is ready."""
+        """Run a command of the page.
+
+        A launch runs in the background, and the function waits until all nodes are ready.
+        """
         command = re.sub(r"\bNAME\b", self.name, command).replace("URL", "$TRIAL/clone")
         if command == "make setup":
             self._lend_packages()
@@ -264,7 +267,10 @@ def evaluate_stroke(bag: Path) -> Stroke:
 
 
 async def try_page(folder: Path, until: int) -> list[StepResult]:
-    """Run the commands of the page up to a line number; stop at an unexpected exit code."""
+    """Run the commands of the page up to a line number.
+
+    The function stops at an unexpected exit code.
+    """
     done: list[StepResult] = []
     async with Network(f"fs{os.getpid()}", ADDRESSES) as network:
         computers = {name: Computer(name, network.space(name), folder) for name in HOSTS}
@@ -306,7 +312,6 @@ def prepare(folder: Path) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--until", type=int, default=10**9, metavar="LINE", help="last line to run")
     parser.add_argument("--keep", action="store_true", help="do not delete the folder")
     given = parser.parse_args()
@@ -347,15 +352,7 @@ def main() -> int:
         "stroke": asdict(stroke) if stroke else None,
         "problems": problems,
     }
-    if given.json:
-        print(json.dumps(report | {"steps": [asdict(one) for one in done]}, indent=1))
-    else:
-        print(f"{len(done)} commands of {PAGE.name} typed at commit {commit}")
-        if stroke:
-            print(f"stroke of {stroke.seconds:.1f} s: both arms followed {stroke.following:.1%} of "
-                  f"it, the sheet within {stroke.apart_m * 1e3:.2f} mm (95 %) of where it was "
-                  f"wanted, over {stroke.travel_m * 1e3:.0f} mm")  # fmt: skip
-        print(f"problems: {'; '.join(problems) or 'none'}")
+    print(json.dumps(report, indent=1))
     return 1 if problems else 0
 
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_material
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.benchmarks import (
     LINEAR_DEPTH_M,
     MAX_DEPTH_M,
@@ -39,9 +40,6 @@ from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES, SolidMesh
 from flexsheet.nodes.methods import Trial, measure
 from tests.linear_elasticity import stiffness_matrix
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SPARSE_FACTOR = "one sparse factor (SuperLU), a re-solve"
 SCIKIT_FEM = "scikit-fem, factor and solve"
@@ -68,7 +66,7 @@ ExternalSolver = Callable[[ContactQuery], ExternalSolution]
 
 
 def import_optional(name: str) -> Any | None:
-    """Return an optional module; log a remedy and return None if it is not installed."""
+    """Import an optional module. Log a remedy and return None if the module is not installed."""
     package = {"skfem": "scikit-fem"}.get(name, name)
     try:
         return import_module(name)
@@ -124,7 +122,10 @@ def sparse_factor(body: SceneBody, scene: Scene) -> ExternalSolver:
 
 
 def scikit_fem(body: SceneBody, scene: Scene) -> ExternalSolver | None:
-    """Assemble once with scikit-fem; condense, factor and solve with it for each query."""
+    """Return a solver that assembles once, and condenses, factors and solves for each query.
+
+    Return None if scikit-fem is not installed.
+    """
     skfem = import_optional("skfem")
     if skfem is None:
         return None

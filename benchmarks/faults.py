@@ -26,7 +26,7 @@ from typing import Any
 
 import psutil
 
-from benchmarks.fault_timeline import FaultTimeline
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.running.runs import RUN_VARIABLE
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, LIGHT, Lab, missing
@@ -63,7 +63,10 @@ SILENT_S = 0.1
 """The maximum age of the state of a bridge that follows, in seconds."""
 
 KILLED_SILENT_S = 0.02
-"""The maximum age of the last state of a killed bridge, in seconds; the other arm then stops."""
+"""The maximum age of the last state of a killed bridge, in seconds.
+
+The arm of the other bridge then stops.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,8 @@ class Result:
 async def run_fault(lab: Lab, name: str, work: Work) -> Result:
     """Inject a fault, end it, and wait until both arms follow again.
 
-    work: injects the fault, and returns when it is over and killed processes are restarted.
+    work: function that injects the fault, and returns after the fault has ended and killed
+        processes run again.
     """
     await lab.until(
         lambda: lab.modes() == {"follow"} and lab.strokes(),
@@ -158,11 +162,8 @@ def longest_away_s(reported: list[tuple[float, set[str]]], span: Span) -> float:
     return longest_s
 
 
-async def matrix(lab: Lab, only: str, *, timeline: bool = False) -> list[Result]:
-    """Run all faults, or those whose name contains `only`.
-
-    timeline: print the events after each fault.
-    """
+async def matrix(lab: Lab, only: str) -> list[Result]:
+    """Run all faults, or those whose name contains `only`."""
     await lab.start_all()
     lab.stroke()
     results = []
@@ -170,10 +171,7 @@ async def matrix(lab: Lab, only: str, *, timeline: bool = False) -> list[Result]
     async def case(name: str, work: Work) -> None:
         if only not in name:
             return
-        async with FaultTimeline(lab) as recorded:
-            result = await run_fault(lab, name, work)
-        if timeline:
-            print(recorded.describe(result.during_ns[0] * 1e-9), file=sys.stderr)
+        result = await run_fault(lab, name, work)
         print(json.dumps(asdict(result)), file=sys.stderr, flush=True)
         results.append(result)
 
@@ -246,7 +244,7 @@ def is_run_alive(run_id: str) -> bool:
 
 
 def worst_gaps(lost: list[Gap], results: list[Result]) -> list[Gap | None]:
-    """Return the longest gap in the messages of one writer for each fault; None without a gap.
+    """Return the longest gap in the messages of one writer for each fault, or None without a gap.
 
     A gap belongs to the fault that it overlaps most.
     """
@@ -269,13 +267,16 @@ KILLED_KINDS = {
     "clock": ("clock",),
     "node": ("",),
 }
-"""The words in names of faults by kind of killed process; the first matching kind is used."""
+"""The words in the names of faults, by kind of killed process.
+
+The first kind with a matching word is used.
+"""
 
 
 def summarize(results: list[Result]) -> dict[str, float]:
     """Return the times from a kill to the stop of the arms, s, by kind of killed process.
 
-    follow_again: both arms follow again after the kill of a node's process.
+    Entries named follow_again are the times until both arms follow again.
     """
     killed = [one for one in results if one.stopped_s is not None and "killed" in one.problem]
     found: dict[str, float] = {}
@@ -296,7 +297,7 @@ def rows(
     targets: tuple[Times, Floats],
     lost: list[Gap],
 ) -> list[dict[str, Any]]:
-    """Return one table row per fault with the results of run and bags; lengths are in mm."""
+    """Return one row per fault with the results of the run and of the bags (lengths in mm)."""
     found = []
     for one, gap in zip(results, worst_gaps(lost, results), strict=True):
         sheet = measure_hold(arms, targets, one.during_ns)
@@ -313,30 +314,6 @@ def rows(
     return found
 
 
-def table(cases: list[dict[str, Any]]) -> str:
-    """Return the rows of the table as Markdown."""
-    lines = [
-        "| fault | neither follows after | both again | both followed, of the time until then "
-        "| sheet off by, p50 / p95 | missing in the bag | faults |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for one in cases:
-        stopped, back = one["stopped_s"], one["back_s"]
-        cells = [
-            one["problem"],
-            "went on" if stopped is None else f"{stopped:.2f} s",
-            "never" if back is None else "-" if stopped is None else f"{back:.1f} s",
-            f"{one['followed']:.0%}",
-            "no target"
-            if one["error_p50_mm"] is None
-            else f"{one['error_p50_mm']:.2f} / {one['error_p95_mm']:.2f} mm",
-            f"{one['missing_s']:.2f} s of {one['missing']}" if one["missing"] else "-",
-            "; ".join(one["faults"]) or "-",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 async def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
@@ -346,7 +323,6 @@ async def main() -> int:
         metavar="WORD",
         help="part of the names of the faults or, with --random, of the kinds of faults",
     )
-    parser.add_argument("--timeline", action="store_true", help="print the events after faults")
     parser.add_argument("--light", action="store_true", help="without soft body and renderer")
     parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges, s")
     parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges, s")
@@ -366,7 +342,7 @@ async def main() -> int:
     patience = {"hold_after_s": given.hold_after, "stop_after_s": given.stop_after}
     patience = {name: value for name, value in patience.items() if value is not None}
     async with Lab(without=LIGHT if given.light else (), **patience) as lab:
-        results = await matrix(lab, given.only, timeline=given.timeline)
+        results = await matrix(lab, given.only)
         for process in lab.launchers.values():
             process.send_signal(signal.SIGINT)
         for process in lab.launchers.values():
@@ -394,9 +370,7 @@ async def main() -> int:
     if given.json:
         print(json.dumps(report, indent=1))
     else:
-        print(table(cases))
-        print(f"\nload before and after: {load[0]:.1f}, {os.getloadavg()[0]:.1f} (one minute)")
-        print(f"largest joint speed, true or commanded, over the maker's: {speed:.2f}")
+        print_rows(cases, as_json=False)
         print(f"violations: {', '.join(violations) or 'none'}")
     return 1 if violations else 0
 

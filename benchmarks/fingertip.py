@@ -20,20 +20,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.fingertip_bound import fingertip_bound
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.tracking import Gate
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.pixels import TwinCamera
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 PAIRS, ROUNDS, BOUNDS = 100, 10, 10
@@ -58,7 +55,10 @@ class TestShot:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Times of all calls, s, and error (3,), m, and covariance of each shot; NaN if not found."""
+    """The times of all calls (s), and the error (3,), m, and the covariance of each shot.
+
+    Error and covariance are NaN if the fingertip was not found.
+    """
 
     times_s: Floats
     errors_m: Floats

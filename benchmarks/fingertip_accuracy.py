@@ -1,6 +1,6 @@
 """Measure the accuracy of a fingertip near the sheet, compared with its Cramer-Rao bound.
 
-OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip_accuracy [--places 120] [--json]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip_accuracy [--places 120]
 
 The simulated finger moves at 20 mm/s with tremor. The test positions are uniformly distributed: 60
 mm to each side of the screen's centre, and 40 mm to both sides of its plane. The node's fingertips
@@ -25,12 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.fingertip_bound import fingertip_bound
 from benchmarks.tracking_bench import (
     CALIBRATION_FILE,
-    MACHINE,
     Frame,
     ObservedFrame,
     Observer,
@@ -38,23 +36,23 @@ from benchmarks.tracking_bench import (
     bench_scene,
     twin_camera,
 )
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.calibration import load_calibration, save_calibration
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import TREMOR_BAND_HZ, SineSum
 from flexsheet.nodes.twin.gestures import TREMOR_HAND_M
 from flexsheet.nodes.twin.rig import make_true_camera
 
-Floats = NDArray[np.float64]
-
 LOW_M, HIGH_M = (-0.06, -0.06, -0.04), (0.06, 0.06, 0.04)
 SPEED_M_PER_S = 0.02
 FRAMES = 14
-"""The number of frames at each position, of which the first frames confirm the track."""
+"""The number of frames at each position. The first frames confirm the track."""
 
 SETTLED_FRAMES = 5
 APART_S = 2.0
-"""The time between two positions in seconds, which is long enough to lose the track."""
+"""The time between two positions in seconds. The track is lost in this time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +153,7 @@ def measure(places: int, *, seed: int = 1) -> dict[str, Any]:
     least = np.sqrt(bound_m2(scene, walk))
     pixels = summary(single_errors(exact))
     return {
-        "machine": MACHINE,
+        "machine": machine_name(),
         "places": places,
         "pictures": len(shipped),
         "valid_share": sum(one.valid for one in shipped) / len(shipped),
@@ -170,41 +168,10 @@ def measure(places: int, *, seed: int = 1) -> dict[str, Any]:
     }
 
 
-def table(found: dict[str, Any]) -> str:
-    lines = [
-        f"{found['places']} places, {found['pictures']} pictures ({found['machine']})",
-        "",
-        "| | rms | 99 % | most | rms along x / y / z |",
-        "|---|---|---|---|---|",
-    ]
-    for key, title in (
-        ("shipped_calibration_single", "shipped calibration, single pictures"),
-        ("shipped_calibration_tracked", "shipped calibration, tracked"),
-        ("true_optics_single", "true optics, single pictures"),
-        ("true_optics_tracked", "true optics, tracked"),
-    ):
-        row = found[key]
-        axes = " / ".join(f"{value:.3f}" for value in row["axes_mm"])
-        lines.append(
-            f"| {title} | {row['rms_mm']:.3f} mm | {row['p99_mm']:.3f} mm | {row['max_mm']:.3f} mm "
-            f"| {axes} mm |"
-        )
-    axes = " / ".join(f"{value:.3f}" for value in found["bound_axes_mm"])
-    lines.append(
-        f"| Cramér–Rao bound of the pixels | {found['bound_rms_mm']:.3f} mm | | | {axes} mm |"
-    )
-    ratios = " / ".join(f"{value:.2f}" for value in found["ratio_axes"])
-    lines.append(f"| single pictures over the bound | {found['ratio']:.2f} × | | | {ratios} × |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--places", type=int, default=120)
-    parser.add_argument("--json", action="store_true")
-    given = parser.parse_args()
-    found = measure(given.places)
-    print(json.dumps(found) if given.json else table(found))
+    print(json.dumps(measure(parser.parse_args().places), indent=1))
 
 
 if __name__ == "__main__":

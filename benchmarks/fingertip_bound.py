@@ -13,13 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.pixels import CameraView, Position, Sensor, TwinCamera, Window
 from flexsheet.nodes.twin.rig import pixels_per_slope
-
-Floats = NDArray[np.float64]
 
 STEP_PX = 0.02
 """Half the step of the numeric derivatives by position, radius and blur, in px."""
@@ -32,15 +30,15 @@ MAX_CONDITION = 1e10
 
 
 class BoundError(ValueError):
-    """Error: the marker is not in both images, or its position is not observable."""
+    """Raised if the marker is not in both images, or if its position is not observable."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
     """The minimum covariances of an unbiased estimate.
 
-    position_m2: (3, 3) of the fingertip in the world, from both views.
-    views_px2: (2, 2) of the marker's centre in the left and in the right view.
+    position_m2: covariance (3, 3) of the fingertip in the world frame, from both views.
+    views_px2: covariances (2, 2) of the marker's centre in the left and in the right view.
     """
 
     position_m2: Floats

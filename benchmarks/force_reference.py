@@ -26,15 +26,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.hexahedra import HexMesh, cylinder_hexahedra
 from flexsheet.launch.experiments.compliance import POSITIONS_M
 from flexsheet.launch.experiments.force_reference import REFERENCE_FILE
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Cylinder, Scene, StripSupport, require_material
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 PENALTY, STIFFER = 1000.0, 4000.0
@@ -56,12 +54,12 @@ CURVE_KEYS = (
 POINTS_PER_EDGE = 6
 TOLERANCE, MAX_ITERATIONS = 1e-4, 25
 MAX_STEP, MIN_FRACTION = 0.3, 1.0 / 16.0
-"""The maximum load step in finger radii, and the minimum one as a fraction of a depth step."""
+"""The maximum load step (finger radii), and the minimum load step per depth step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """The inputs of one force curve; lengths are in finger radii.
+    """The inputs of one force curve (lengths in finger radii).
 
     along, angle_rad: pushed position along and around the axis. scale: factor of all element sizes.
     penalty: stiffness of the contact, see `PENALTY`.
@@ -130,7 +128,7 @@ class SphereContact:
     def tangent(self, positions: Floats, centre: Floats, turning: float) -> Any:
         """Return the second derivative of the energy as a sparse matrix.
 
-        turning: weight of its indefinite part.
+        turning: weight of the indefinite part of the matrix.
         """
         from scipy.sparse import coo_matrix
 
@@ -206,7 +204,7 @@ class FelupeBody:
         return result.reshape(-1, 3)
 
     def equilibrium(self, moved: Floats, centre: Floats) -> Floats | None:
-        """Return the displacement (n, 3) with the sphere at `centre`; None without convergence."""
+        """Return the displacement (n, 3) for a sphere at `centre`, or None without convergence."""
         energy = self.energy(moved, centre)
         for _ in range(MAX_ITERATIONS):
             right, scale = self.residual(moved, centre)
@@ -295,7 +293,7 @@ def reference_pushes(scene: Scene) -> list[Push]:
 
 
 def solve_runs(pushes: Sequence[Push], output: Path) -> None:
-    """Solve the pushes whose force curves are not complete in the file; store each depth."""
+    """Solve the pushes without a complete force curve in the file, and store each depth."""
     runs = json.loads(output.read_text())["runs"] if output.exists() else []
     for push in pushes:
         inputs = asdict(push)
@@ -323,7 +321,7 @@ def solve_runs(pushes: Sequence[Push], output: Path) -> None:
 
 
 def write_result(runs: list[dict[str, Any]], output: Path) -> None:
-    """Write the runs and the force curves that are computed from them."""
+    """Write the runs, and the force curves computed from the runs."""
     result = {
         "command": "python -m benchmarks.force_reference",
         "method": "NeoHookeCompressible, 27-node hexahedra, penalty contact of a rigid sphere",

@@ -27,7 +27,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from benchmarks.force_reference import (
     DEPTHS,
@@ -40,23 +39,22 @@ from benchmarks.force_reference import (
     reference_pushes,
 )
 from benchmarks.hexahedra import HexMesh
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_material
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from flexsheet.nodes.arrays import Floats, Ints
 
 MAX_DEPTH = 1.5
 """Maximum depth, in finger radii, at which the programs are compared."""
 SUMMARY_DEPTH_MM = 2.0
-"""Minimum depth of the summary; at smaller depths the two meshes are too coarse."""
+"""Minimum depth of the summary. At smaller depths, the two meshes are too coarse."""
 MESHES = SCALES[:2]
 """Scales of the two meshes."""
 SUBDIVISIONS = 4
 """Subdivisions of the icosahedron that represents the finger."""
 SHELL_RATIO = 0.9
-"""Inner radius of the shell of wedges whose outer surface is the finger."""
+"""Inner radius of the shell of wedges that represents the finger, divided by the outer radius."""
 INCREMENT = 0.1
 """First increment of each load step, as a fraction of the step."""
 
@@ -130,7 +128,7 @@ def _rows(numbers: Ints, values: Floats) -> Iterable[str]:
 
 
 def _elements(first: int, nodes: Ints) -> Iterable[str]:
-    """Yield the lines of elements; a line contains at most 16 numbers."""
+    """Yield the lines of elements, each with at most 16 numbers."""
     for number, row in enumerate(nodes.tolist(), first):
         names = [str(one) for one in (number, *row)]
         yield ", ".join(names[:15]) + ("," if len(names) > 15 else "")
@@ -139,7 +137,10 @@ def _elements(first: int, nodes: Ints) -> Iterable[str]:
 
 
 def solve_with_calculix(push: Push, depths: Sequence[float]) -> list[float]:
-    """Return the normal forces at the depths; raises WitnessError without CalculiX or result."""
+    """Return the normal forces at the depths.
+
+    Raises WitnessError if CalculiX is not installed or does not converge.
+    """
     program = shutil.which("ccx")
     if program is None:
         raise WitnessError("`ccx` is not installed; install the package `calculix-ccx`")
@@ -222,11 +223,7 @@ def main() -> None:
         version = subprocess.run(["ccx", "-v"], capture_output=True, text=True, check=False).stdout
         print(json.dumps({"version": version.strip(), **summarize(rows), "rows": rows}))
         return
-    for row in rows:
-        print(
-            f"{row['depth_mm']:5.1f} mm: CalculiX {row['calculix_n']:.4f} N, reference "
-            f"{row['reference_n']:.4f} N, difference {row['difference_percent']:+.1f} %"
-        )
+    print_rows(rows, as_json=False)
 
 
 if __name__ == "__main__":

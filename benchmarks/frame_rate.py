@@ -14,12 +14,12 @@ import json
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.frame_cpu import STRETCH, bodies, compute_skin, predict_sheet
 from flexsheet.launch.experiments.stroke import read_recording, stroke_span_ns
 from flexsheet.launch.experiments.trial import run_stroke
 from flexsheet.launch.methods.results import describe_load, machine_name
@@ -27,22 +27,28 @@ from flexsheet.launch.methods.svg import page_style, save_svg
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Display
+from flexsheet.messages.types import Display, Skin, SoftBody
+from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
+from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.gl import SOFTWARE_DRIVERS, NoOpenGLError, headless_context
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE, DEMO = ROOT / "launch" / "scenes" / "cylinder.yaml", ROOT / "launch" / "demo.yaml"
 NAME = "correction-frames"
 NO_GPU_CODE = 3
 WARM_UP = 20
+SKIN_SPACING_M = 0.0045
+STRETCH = 1.05
 
 
 def find_driver() -> str:
-    """Return the name of the OpenGL driver; an empty string if OpenGL is not available."""
+    """Return the name of the OpenGL driver, or an empty string without OpenGL."""
     try:
         context = headless_context()
     except NoOpenGLError:
@@ -52,8 +58,57 @@ def find_driver() -> str:
     return name
 
 
+def compute_skin(scene: Scene) -> Skin:
+    """Compute the solver's skin with the demo's spacing."""
+    mesh = mesh_scene(scene, SKIN_SPACING_M)
+    points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
+    return Skin(
+        mesh_id="bench",
+        vertices_world_m=points.astype(np.float32),
+        triangles=mesh.skin_triangles,
+    )
+
+
+def bodies(skin: Skin) -> Iterator[SoftBody]:
+    """Yield soft bodies pushed 15 mm deep at several points."""
+    points = skin.vertices_world_m.astype(np.float64)
+    for number in range(10**6):
+        place = 0.02 * np.array([np.sin(0.1 * number), np.cos(0.1 * number)])
+        away = np.linalg.norm(points[:, :2] - place, axis=1)
+        depth = 0.015 * np.exp(-((away / 0.015) ** 2))
+        yield SoftBody(
+            mesh_id="bench",
+            method="bench",
+            in_range=True,
+            push_depth_m=0.015,
+            force_world_n=np.zeros(3),
+            stiffness_n_per_m=0.0,
+            displacement_world_m=(depth[:, None] * [0.0, 0.0, -1.0]).astype(np.float32),
+        )
+
+
+def predict_sheet(scene: Scene, edges: tuple[Floats, Floats], number: int) -> SheetPose:
+    """Return the predicted sheet between two edges.
+
+    number: number of the frame, which determines the pushed point.
+    """
+    tip = np.array([0.02 * np.sin(0.1 * number), 0.02 * np.cos(0.1 * number), -0.015])
+    sheet = estimate_sheet(
+        *edges,
+        height_m=scene.sheet.height_m,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=tip,
+    )
+    assert sheet is not None
+    return sheet
+
+
 def measure_frames(scene: Scene, frames: int) -> dict[str, float]:
-    """Return wall and processor time of stereo frames, ms; each has a new sheet and soft body."""
+    """Return the wall time and processor time (ms) of stereo frames.
+
+    Each frame has a new sheet pose and a new soft body.
+    """
     given = RendererParameters()
     renderer = SceneRenderer(
         scene,
@@ -101,7 +156,7 @@ def measure_stroke(seconds: float) -> dict[str, Any]:
 
 
 def add_point(point: dict[str, Any], folder: Path) -> list[dict[str, Any]]:
-    """Add a machine's point to the chart in a folder; return all points."""
+    """Add the point of a machine to the chart in a folder, and return all points."""
     numbers = folder / f"{NAME}.json"
     points = json.loads(numbers.read_text())["points"] if numbers.exists() else []
     same = ("machine", "driver")

@@ -27,7 +27,6 @@ FOUND = ("crash", "oom", "timeout")
 """The name prefixes of the files in which atheris stores findings."""
 
 MAX_BYTES = 1 << 20
-TARGETS = ("wire", "bag", "launch", "scene", "mesh", "modbus", "mxt")
 MODULES = {
     "wire": ("flexsheet.messages.wire", "flexsheet.messages.bus", "flexsheet.messages.arrays"),
     "bag": ("flexsheet.messages.bag", "flexsheet.messages.migrations", "flexsheet.messages.wire"),
@@ -43,6 +42,8 @@ MODULES = {
     "mxt": ("flexsheet.nodes.arm_bridge.mxt", "flexsheet.nodes.twin.mxt_controller"),
 }
 """Modules to instrument for coverage, by target."""
+
+TARGETS = tuple(MODULES)
 
 
 def fuzz(name: str, corpus: Path, seconds: float) -> None:

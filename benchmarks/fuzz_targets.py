@@ -80,7 +80,7 @@ _log = logging.getLogger("flexsheet.fuzz")
 
 
 class Finding(AssertionError):
-    """Error: an input had a forbidden effect."""
+    """Raised if an input had a forbidden effect."""
 
 
 class ExecutionMonitor:
@@ -125,7 +125,7 @@ def _peak_bytes() -> int:
 class Target:
     """A target of fuzzing.
 
-    run: function that decodes bytes; it returns False if it raised the declared error.
+    run: function that decodes bytes, and returns False if the declared error was raised.
     """
 
     name: str
@@ -135,7 +135,10 @@ class Target:
     mutate: Mutate
 
     def check(self, data: bytes) -> bool:
-        """Run the target on bytes; raise Finding and its undeclared exceptions."""
+        """Run the target on bytes.
+
+        Raises Finding for a forbidden effect, and any undeclared exception of the target.
+        """
         with ExecutionMonitor.looks(), bounded_memory():
             return self.run(data)
 
@@ -243,7 +246,7 @@ def _mutate_dict(
 
 
 def example(kind: Any) -> Any:
-    """Return a strategy for valid values of a message's field, or of a message, by its type."""
+    """Return a valid example of a message type, or of the type of a message field."""
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         fields = kind.model_fields.items()
         # The annotations of the class contain the constraints, which pydantic stores separately.
@@ -288,7 +291,7 @@ def messages_of_scene() -> dict[str, Message]:
 
 
 def wire_seeds() -> list[bytes]:
-    """Return a message of each topic: the topic's number, then its frames as in a bag."""
+    """Return a message of each topic, as the number of the topic and the frames of the message."""
     found = []
     for number, topic in enumerate(TOPICS.values()):
         message = messages_of_scene().get(topic.name) or example(topic.message)
@@ -300,7 +303,7 @@ def wire_seeds() -> list[bytes]:
 
 @cache
 def listener(name: str) -> Subscriber:
-    """Return a subscriber without a connection, to which frames are passed directly."""
+    """Return a subscriber without a connection."""
 
     def inbox(message: Message, header: Header) -> None:
         """Do nothing with a message."""
@@ -382,7 +385,7 @@ Record = tuple[int, bytes]
 
 @cache
 def bag_seeds() -> list[bytes]:
-    """Return small bags: compressed or not, with an attachment, metadata, and a truncated one."""
+    """Return small bags with attachment and metadata: compressed, uncompressed and truncated."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for compress in (True, False):
@@ -500,7 +503,7 @@ def odd_in_a_schema(chance: random.Random) -> Any:
 
 
 def _mutate_chunk(body: bytes, chance: random.Random) -> bytes:
-    """Mutate one of the records of a chunk; correct size and check sum, or leave them wrong."""
+    """Mutate one record of a chunk. The size of the chunk is sometimes left wrong."""
     start, end, size, _ = struct.unpack_from("<QQQI", body)
     name_length = struct.unpack_from("<I", body, 28)[0]
     name = body[32 : 32 + name_length]
@@ -519,7 +522,7 @@ def _mutate_chunk(body: bytes, chance: random.Random) -> bytes:
 
 
 def import_nodes() -> None:
-    """Import the nodes before a monitor is on; some libraries start processes when imported."""
+    """Import all nodes. Some libraries start processes during their import."""
     for name in NODES:
         node_class(name)
 
@@ -604,7 +607,7 @@ def remove_launch_folder() -> None:
 
 
 def run_launch(data: bytes) -> bool:
-    """Load a launch file as a plan; the last line may be a setting for `--set`."""
+    """Load a launch file as a plan. The last line may be a setting for `--set`."""
     path = launch_folder() / "fuzz.yaml"
     text, mark, setting = data.partition(b"\n#--set ")
     path.write_bytes(text)
@@ -749,7 +752,7 @@ class FakeArm:
 
 
 def correct_answer(answer: bytes, flags: int, request: bytes) -> bytes:
-    """Correct the parts of an answer that `flags` selects, so that they match the request."""
+    """Correct the parts of an answer that `flags` selects, to match the request."""
     block = 9
     if flags & TID and len(answer) >= 2:
         answer = request[:2] + answer[2:]
@@ -786,7 +789,7 @@ def modbus_seeds() -> list[bytes]:
 
 
 def run_modbus(data: bytes) -> bool:
-    """Decode bytes as the answer of an arm, and their registers as a status and a command."""
+    """Decode bytes as the answer of an arm, and the registers in them as status and command."""
     taken = fake_arm().ask(data)
     body = data[10 : 10 + 2 * _REGISTERS]
     registers = list(struct.unpack(f">{len(body) // 2}H", body[: len(body) // 2 * 2]))
@@ -842,7 +845,7 @@ def run_mxt(data: bytes) -> bool:
 
 
 def mutate_mxt(data: bytes, chance: random.Random) -> bytes:
-    """Mutate numbers of a packet or its bytes; duplicate or reorder packets."""
+    """Mutate the numbers or bytes of a packet, or duplicate packets."""
     if len(data) >= PACKET_BYTES and chance.random() < 0.5:
         place = chance.randrange(len(data) // PACKET_BYTES) * PACKET_BYTES
         odd = chance.choice((float("nan"), float("inf"), -1e30, 0.0, 3.0, 1e-40))

@@ -18,14 +18,14 @@ Ints = NDArray[np.int64]
 TOP_RAD = 1.7
 """Half the angle of the arc, centred on +z, that is one of four sides of a meshed cross-section."""
 SIZE, NEAR = 0.17, 0.36
-"""The element size near the push, and the distance up to which elements have this size.
+"""The element size near the push, and the radius of the region with elements of this size.
 
-Both are in finger radii at a scale of 1.
+Lengths are in finger radii at a scale of 1.
 """
 GROWTH, MAX_SIZE_RATIO = 0.35, 0.3
 """The increase of the element size per distance from the push, and the maximum element size.
 
-The latter is a fraction of the radius of the cylinder, at a scale of 1.
+The maximum element size is a fraction of the radius of the cylinder, at a scale of 1.
 """
 DEPTH_RATIO = 1.3
 """The ratio of the element size along the depth to that along the skin."""

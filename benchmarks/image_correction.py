@@ -1,6 +1,6 @@
 """Measure the renderer's images against the simulator, without the graph.
 
-python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretches] [frames]
+python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretches]
 
 sizes: figures 11 and 13 of the paper; error of each size as the eye sees it on the true sheet (mm).
     The tilted sheet either rolls on the cylinder (tangent, with a fixed contact line) or rotates
@@ -9,7 +9,6 @@ rolled-sizes-json: mean and largest error of these sizes by two_pass for the rol
 tilts, depths, places, stretches: errors at all points that the eye sees (mean, 95 %, maximum, mm),
     and the visible fraction of the object. They vary the tilt up to 80 degrees, the depth up to 70
     mm, the contact point on upright and tilted sheets, and the stretch.
-frames: time of a stereo frame relative to that without correction, both measured alternately.
 Without a name, all are measured.
 """
 
@@ -17,29 +16,24 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import solve_sheet
 from flexsheet.launch.experiments.image import summarize_eyes
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.benchmarks import (
-    METHODS,
-    SIZES_PX,
     draw_coordinate_ramps,
-    draw_stereo,
     roll_sheet,
-    scale_projector,
 )
 from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
@@ -49,15 +43,11 @@ from flexsheet.nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected,
 from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError
 from flexsheet.nodes.twin.true_object import TrueBody
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
-
 ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
 """The corrections for a flat sheet, for which `one_plane` equals the method of four triangles."""
 EYE_CORRECTIONS: tuple[Correction, ...] = ("none", "two_pass")
-ROUNDS = 40
 
 
 class CorrectionBench:
@@ -247,36 +237,6 @@ def print_stretches(bench: CorrectionBench) -> None:
         row(stretch, cell, bench.stage.note)
 
 
-def print_frames(scene: Scene) -> None:
-    """Print the median wall time of a stereo frame for every method."""
-    basis, context = deflection_cache.load_or_compute(scene, None), headless_context()
-    print(f"\n{context.info['GL_RENDERER']}")
-    heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")
-    for size in SIZES_PX:
-        shown = scale_projector(scene, *size)
-        bench_stage = SceneRenderer(shown, context, spacing_m=0.0025, basis=basis)
-        edges = edge_poses(np.eye(4), scene.sheet.width_m * 1.05)
-        tip = np.array([0.0, 0.0, -0.03])
-        sheet = estimate_sheet(*edges, height_m=scene.sheet.height_m, finger_tip=tip)
-        assert sheet is not None
-        wall, cpu = ({method: np.empty(ROUNDS) for method in METHODS} for _ in range(2))
-        for method in METHODS:
-            draw_stereo(bench_stage, method, sheet)
-        for turn in range(ROUNDS):
-            for method in METHODS:
-                begun, begun_cpu = time.perf_counter(), time.process_time()
-                draw_stereo(bench_stage, method, sheet)
-                wall[method][turn] = time.perf_counter() - begun
-                cpu[method][turn] = time.process_time() - begun_cpu
-        for method in METHODS:
-            cells = []
-            for taken in (wall, cpu):
-                median, floor = np.median(taken[method]), np.median(taken[METHODS[0]])
-                cells += [f"{1e3 * median:.1f}", f"{median / floor:.2f}"]
-            row(f"{size[0]}x{size[1]}", method, *cells)
-    context.release()
-
-
 TABLES: dict[str, Callable[[CorrectionBench], None]] = {
     "sizes": print_sizes,
     "rolled-sizes-json": print_rolled_sizes_json,
@@ -290,19 +250,13 @@ TABLES: dict[str, Callable[[CorrectionBench], None]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tables", nargs="*", choices=[*TABLES, "frames", []], metavar="TABLE")
+    parser.add_argument("tables", nargs="*", choices=[*TABLES, []], metavar="TABLE")
     parser.add_argument("--scene", default=ROOT / "launch" / "scenes" / "cylinder.yaml", type=Path)
     parser.add_argument("--stretch", default=1.05, type=float)
     options = parser.parse_args()
-    wanted = options.tables or [*(name for name in TABLES if "json" not in name), "frames"]
-    scene = load_scene(options.scene)
-    if "frames" in wanted:
-        print_frames(scene)
-    if set(wanted) & set(TABLES):
-        bench = CorrectionBench(scene, stretch=options.stretch)
-        for name in wanted:
-            if name in TABLES:
-                TABLES[name](bench)
+    bench = CorrectionBench(load_scene(options.scene), stretch=options.stretch)
+    for name in options.tables or [name for name in TABLES if "json" not in name]:
+        TABLES[name](bench)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure the cost of encryption: a message between processes by tcp, with CURVE and without.
 
-python -m benchmarks.keys [--rounds N] [--seconds S] [--json FILE]
+python -m benchmarks.keys [--rounds N] [--seconds S]
 
 As in `benchmarks.messaging`, one process publishes, and one per design receives. The latency is one
 way, from before the message is constructed to its handler. The result is the ratio within a round.
@@ -14,8 +14,6 @@ import argparse
 import asyncio
 import json
 import os
-import random
-import statistics
 import tempfile
 import threading
 import timeit
@@ -28,13 +26,14 @@ from typing import Any, TypeVar
 import uvloop
 
 from benchmarks import messaging
-from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Sender, percentile_us
+from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Payload, Sender
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.security import KeyRing, make_key_pair, write_ring, write_secret
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.wire import encode, read_envelope
+from flexsheet.nodes.node import PortCounts
 
 T = TypeVar("T")
 RING_VARIABLE = "FLEXSHEET_BENCHMARK_RING"
@@ -53,7 +52,7 @@ def listen(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> 
 
         keys = KeyRing(Path(os.environ[RING_VARIABLE]))
         source = Source(endpoint, "bench", "main")
-        subscriber = Subscriber(topic, [source], on_message, messaging.Counts(), keys=keys)
+        subscriber = Subscriber(topic, [source], on_message, PortCounts(), keys=keys)
         subscriber.start()
         await ended
         subscriber.close()
@@ -86,7 +85,7 @@ class Loop:
 
 @contextmanager
 def create_two_rings(folder: Path) -> Iterator[KeyRing]:
-    """Create the key rings of two hosts; child processes use the ring of the second host."""
+    """Create the key rings of two hosts. Child processes use the ring of the second host."""
     public = {}
     for host in ("main", "left"):
         public[host], secret = make_key_pair()
@@ -104,60 +103,54 @@ def create_two_rings(folder: Path) -> Iterator[KeyRing]:
 
 
 async def open_for_thread(topic: Topic, bind: list[str], keys: KeyRing) -> Publisher:
-    """Open a publisher for another thread; the event loop then ignores its socket."""
+    """Open a publisher for use in another thread.
+
+    The event loop of this thread does not read the socket.
+    """
     publisher = Publisher(topic, bind, keys=keys)
     await asyncio.sleep(0)
     asyncio.get_running_loop().remove_reader(publisher._socket.fileno())
     return publisher
 
 
+class KeyedLine(BusLine):
+    """A publisher with keys, which needs a running event loop."""
+
+    def __init__(self, payload: Payload, place: str, ring: KeyRing, loop: Loop) -> None:
+        super().__init__(
+            DESIGNS[1], payload, place, lambda topic, at: loop.do(open_for_thread(topic, at, ring))
+        )
+        self._loop = loop
+
+    def close(self) -> None:
+        async def closed() -> None:
+            self._publisher.close()
+
+        self._loop.do(closed())
+
+
 def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict[str, Any]]:
-    """Return p50, p99 and the median of the ratios over rounds, of both designs per payload."""
+    """Return the rows of `messaging.measure`, with ratios to the design without keys."""
+    place = "tcp://127.0.0.1:*"
 
-    async def open_publisher(topic: Topic, endpoint: str) -> Publisher:
-        return await open_for_thread(topic, [endpoint], keys)
+    def open_sender(design: Design, payload: Payload, number: int) -> Sender:
+        keyed = design.name == WITH
+        line = KeyedLine(payload, place, keys, loop) if keyed else BusLine(design, payload, place)
+        return Sender(design, payload, line)
 
-    async def close_publisher(publisher: Publisher) -> None:
-        publisher.close()
-
-    rows = []
-    for payload in PAYLOADS:
-        count = round(seconds * payload.rate_hz)
-        senders = {}
-        secured: list[Publisher] = []
-
-        def secure(topic: Topic, bind: list[str], secured: list[Publisher] = secured) -> Publisher:
-            secured.append(loop.do(open_publisher(topic, bind[0])))
-            return secured[-1]
-
-        for design in DESIGNS:
-            opener = secure if design.name == WITH else Publisher
-            line = BusLine(design, payload, "tcp://127.0.0.1:*", opener)
-            senders[design.name] = Sender(design, payload, line)
-        found: dict[str, list[tuple[float, float]]] = {design.name: [] for design in DESIGNS}
-        for _ in range(rounds):
-            for name in random.sample(list(senders), len(senders)):
-                taken = senders[name].round(count)
-                found[name].append((percentile_us(taken, 50), percentile_us(taken, 99)))
-        for name, sender in senders.items():
-            if name == WITHOUT:
-                sender.close()
-            else:
-                sender.send(messaging.END)
-        for one in secured:
-            loop.do(close_publisher(one))
-        row: dict[str, Any] = {"payload": payload.name}
-        for number, percent in enumerate(("p50", "p99")):
-            for name, short in ((WITHOUT, "without"), (WITH, "with")):
-                row[f"{percent}_{short}_us"] = statistics.median(one[number] for one in found[name])
-            ratios = [
-                own[number] / base[number]
-                for own, base in zip(found[WITH], found[WITHOUT], strict=True)
-            ]
-            row[f"{percent}_ratio"] = statistics.median(ratios)
-            row[f"{percent}_ratio_range"] = [min(ratios), max(ratios)]
-        rows.append(row)
-    return rows
+    return [
+        row
+        for payload in PAYLOADS
+        for row in messaging.measure(
+            payload,
+            DESIGNS,
+            rounds=rounds,
+            seconds=seconds,
+            open_sender=open_sender,
+            step=lambda: None,
+            reference=WITHOUT,
+        )
+    ]
 
 
 def cost_of_checks() -> dict[str, float]:
@@ -175,7 +168,7 @@ def cost_of_checks() -> dict[str, float]:
             read_envelope(frames, payload.topic)
 
     def accept() -> None:
-        subscriber = Subscriber(payload.topic, [], lambda *_: None, messaging.Counts(), plan=plan)
+        subscriber = Subscriber(payload.topic, [], lambda *_: None, PortCounts(), plan=plan)
         for frames in many:
             subscriber.accept(frames, writers)
 
@@ -189,7 +182,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=2.0, help="per design and round")
-    parser.add_argument("--json", type=Path, help="JSON file to write")
     options = parser.parse_args()
     load = os.getloadavg()[0]
     loop = Loop()
@@ -205,8 +197,6 @@ def main() -> None:
         "latency": rows,
         "checks": cost_of_checks(),
     }
-    if options.json is not None:
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
     print(json.dumps(report, indent=1))
 
 

@@ -1,6 +1,6 @@
 """Verify that no command leads an arm out of its limits, with random and adversarial commands.
 
-    python -m benchmarks.limiter [--commands 1000000] [--seed 0] [--json]
+    python -m benchmarks.limiter [--commands 1000000] [--seed 0]
 
 Nine commands in ten are joint goals: NaN, jumps, edges of the range, alternating extremes, false
 velocities, rotating wrists, motions at the tool's speed limit, and sequences that hypothesis
@@ -34,7 +34,6 @@ from typing import Any
 import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings, target
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
@@ -51,6 +50,7 @@ from flexsheet.nodes.arm_bridge.limiter import (
 from flexsheet.nodes.arm_bridge.link import Freshness
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.state_machine import Event
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform, transform_from_rpy
 from flexsheet.nodes.twin.arms import (
@@ -59,8 +59,6 @@ from flexsheet.nodes.twin.arms import (
     decelerate,
 )
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Random = np.random.Generator
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -100,7 +98,7 @@ class AdversaryCounts:
 
     cycles: int = 0
     moved: int = 0
-    tool_speed_share: float = 0.0
+    tool_speed_ratio: float = 0.0
 
 
 @dataclass
@@ -114,8 +112,8 @@ class Tally:
     pass_ns: list[int] = field(default_factory=list)
     under: dict[str, AdversaryCounts] = field(default_factory=lambda: defaultdict(AdversaryCounts))
 
-    def check_ratio(self, name: str, share: Floats | float, allowed: Flags | bool = False) -> None:
-        """Count ratios to a limit above 1; ratios that are `allowed` are counted separately."""
+    def check_ratio(self, name: str, share: Floats | float, allowed: Bools | bool = False) -> None:
+        """Count the ratios to a limit that exceed 1. Allowed ratios are counted separately."""
         shares = np.atleast_1d(np.asarray(share, dtype=np.float64))
         if shares.size == 0:
             return
@@ -170,7 +168,7 @@ class CheckedServos:
         self.servo.velocity_rad_per_s = np.zeros_like(joints_rad)
         self._tool, self._fastest = find_tool_points(scene), scene.arms.max_tool_speed_m_per_s
         self._tally = tally
-        self.speed_share = np.zeros(len(joints_rad))
+        self.speed_ratio = np.zeros(len(joints_rad))
         """The maximum ratio to the tool speed of each arm in the last `advance`."""
 
     def advance(
@@ -179,7 +177,7 @@ class CheckedServos:
         duration_s: float,
         moving: Floats,
         *,
-        catching_up: Flags | bool = False,
+        catching_up: Bools | bool = False,
     ) -> None:
         """Advance all arms by `duration_s`.
 
@@ -189,7 +187,7 @@ class CheckedServos:
         steps = int(np.ceil(duration_s / 1e-3))
         step_s = duration_s / steps
         servo, tally = self.servo, self._tally
-        self.speed_share = np.zeros(len(servo.joints_rad))
+        self.speed_ratio = np.zeros(len(servo.joints_rad))
         for _ in range(steps):
             joints, velocity = servo.joints_rad, servo.velocity_rad_per_s
             before = points_on_tool(joints, self._tool)
@@ -207,7 +205,7 @@ class CheckedServos:
             tally.check_ratio("simulated acceleration", share[moving >= 0])
             speed = np.linalg.norm(after - before, axis=2).max(axis=1) / step_s
             tally.check_ratio("simulated tool speed", speed / self._fastest, allowed=catching_up)
-            self.speed_share = np.maximum(self.speed_share, speed / self._fastest)
+            self.speed_ratio = np.maximum(self.speed_ratio, speed / self._fastest)
 
     def _hold_back(self, joints: Floats, velocity: Floats, moving: Floats, step_s: float) -> None:
         """Undo the step of frozen arms, and decelerate stopping arms."""
@@ -232,11 +230,6 @@ class Lane:
 
 Adversary = Callable[[Random, JointLimits, Lane], Iterator[tuple[Floats, Floats]]]
 STROKE_CYCLES = 4000
-PASSES = {
-    "stroke_us": "IK and limiter, strokes",
-    "limiter_us": "limiter, adversaries",
-    "bridge_pass_us": "a bridge's whole decision, adversaries",
-}
 STILL = np.zeros(6)
 
 
@@ -248,7 +241,7 @@ def _anywhere(random: Random, limits: JointLimits, beyond: float = 0.0) -> Float
 def random_goals(
     random: Random, limits: JointLimits, lane: Lane
 ) -> Iterator[tuple[Floats, Floats]]:
-    """Yield random goals within and beyond the range; each goal is repeated for some cycles."""
+    """Yield random goals within and beyond the range, each for some cycles."""
     while True:
         goal = _anywhere(random, limits, 0.5)
         for _ in range(random.integers(1, 60)):
@@ -347,7 +340,10 @@ def joint_goals(
     found_sequences: Sequence[Sequence[Floats]],
     tally: Tally,
 ) -> None:
-    """Pass this number of joint goals through the limiter to simulated arms."""
+    """Pass joint goals through the limiter to simulated arms.
+
+    commands: number of goals.
+    """
     geometry = ArmGeometry(scene, "left")
     limits = geometry.joint_limits
 
@@ -423,12 +419,12 @@ def check_commands(
     tally.check_ratio("commanded speed", np.abs(new) / limits.speed_rad_per_s)
     here = points_on_tool(held, tool)
 
-    def tool_share(velocity: Floats) -> Floats:
+    def compute_tool_ratio(velocity: Floats) -> Floats:
         gone = points_on_tool(held + velocity * step_s, tool) - here
         furthest: Floats = np.linalg.norm(gone, axis=2).max(axis=1)
         return furthest / (min(step_s, MAX_TRAVEL_STEP_S) * fastest)
 
-    tally.check_ratio("commanded tool speed", tool_share(new))
+    tally.check_ratio("commanded tool speed", compute_tool_ratio(new))
     # Allowed if the full deceleration would exceed tool speed or range.
     most = limits.acceleration_rad_per_s2 * step_s
     slowest = np.sign(old) * np.maximum(np.abs(old) - most, 0.0)
@@ -436,15 +432,15 @@ def check_commands(
     slowed = old * np.maximum(0.0, 1.0 - step_s / np.maximum(stopping_s, 1e-12))
     there = held + slowest * step_s
     slowed = clamp_to_range(held, old, slowed, limits=limits, step_s=step_s)
-    forced = (tool_share(slowed) > 1.0) | ((there < limits.min_rad) | (there > limits.max_rad)).any(
-        axis=1
-    )
+    forced = (compute_tool_ratio(slowed) > 1.0) | (
+        (there < limits.min_rad) | (there > limits.max_rad)
+    ).any(axis=1)
     share = (np.abs(new - old) / most).max(axis=1)
     tally.check_ratio("commanded acceleration", share, allowed=forced)
 
 
 def search_sequences(scene: Scene) -> list[list[Floats]]:
-    """Search for sequences of goals near the limits with hypothesis; return the worst ones."""
+    """Search for sequences of goals near the limits with hypothesis, and return the worst."""
     geometry = ArmGeometry(scene, "left")
     limits = geometry.joint_limits
     width = limits.max_rad - limits.min_rad
@@ -501,7 +497,7 @@ class FalseMeasurement:
     cycles: int
     lag: int
     shift_rad: Floats
-    order: NDArray[np.int64]
+    order: Ints
     held_rad: Floats | None = None
     begun: int = 0
 
@@ -519,7 +515,7 @@ class FalseMeasurement:
         )
 
     def report(self, history: History, arm: int) -> tuple[Floats, Freshness]:
-        """Return the joints (6,) that the arm reports, and the freshness of its counters."""
+        """Return the joints (6,), rad, that the arm reports, and the freshness of the counters."""
         joints, freshness = history[-1][arm], Freshness.FRESH
         for kind in self.kinds:
             joints, fresh = FALSE_KINDS[kind](self, history, arm, joints)
@@ -534,7 +530,7 @@ class FalseMeasurement:
         return self.held_rad, Freshness.FRESH
 
     def stale(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
-        """Repeat the first measurement and its counters."""
+        """Repeat the first measurement with the same counters."""
         held, _ = self.frozen(history, arm, joints)
         stalled = self.begun >= MAX_UNCHANGED_CYCLES
         return held, Freshness.STALLED if stalled else Freshness.REPEATED
@@ -561,7 +557,7 @@ class FalseMeasurement:
     def replayed_whole(
         self, history: History, arm: int, joints: Floats
     ) -> tuple[Floats, Freshness]:
-        """Repeat a part of the past with its counters."""
+        """Repeat a part of the past with the old counters."""
         return self.replayed(history, arm, joints)[0], Freshness.REVERSED
 
 
@@ -581,8 +577,8 @@ FALSE_KINDS: dict[str, Callable[..., tuple[Floats, Freshness]]] = {
 class SecondMaster:
     """A second client that commands the same arm for some cycles, at up to half the tool speed.
 
-    refuses: whether the controller rejects the bridge's commands; otherwise it executes both in
-        turn.
+    refuses: whether the controller rejects the commands of the bridge. Otherwise the controller
+        executes the commands of both clients in turn.
     """
 
     joints_rad: Floats
@@ -656,7 +652,7 @@ class Bridge:
             self.control.on_exchange_failed("no answer", silent=True)
 
     def other_command(self, random: Random, joints_rad: Floats, step_s: float) -> Floats | None:
-        """Return the joints (6,), rad, that a second master sends; None if there is none."""
+        """Return the joints (6,), rad, from a second master, or None without a second master."""
         if self.second is None and random.random() < SECOND_CHANCE:
             self.second = second_master(random, self.geometry, joints_rad)
         if self.second is None:
@@ -706,7 +702,10 @@ def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
 
 
 def sheet_targets(commands: int, random: Random, scene: Scene, tally: Tally) -> None:
-    """Run pairs of bridges with simulated arms until they have sent this number of commands."""
+    """Run pairs of bridges with simulated arms.
+
+    commands: number of commands that all bridges send together.
+    """
     end = tally.commands + commands
     while tally.commands < end:
         left = (end - tally.commands) // (2 * PAIRS) + 1
@@ -739,7 +738,7 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
         arms.advance(wanted, step_s, moving, catching_up=thaw_s > 0.0)
         noise = NOISE_RAD * random.standard_normal(arms.servo.joints_rad.shape)
         history.append(arms.servo.joints_rad + noise)
-        note_adversaries(tally, bridges, arms.speed_share, moving=moving, catching_up=thaw_s > 0.0)
+        note_adversaries(tally, bridges, arms.speed_ratio, moving=moving, catching_up=thaw_s > 0.0)
         thaw_s = thaw_s - step_s
         pair_goals = [next(goal) for goal in goals]
         for number, bridge in enumerate(bridges):
@@ -776,15 +775,15 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
 
 
 def note_adversaries(
-    tally: Tally, bridges: list[Bridge], speed_share: Floats, *, moving: Floats, catching_up: Flags
+    tally: Tally, bridges: list[Bridge], speed_ratio: Floats, *, moving: Floats, catching_up: Bools
 ) -> None:
-    """Record the arms' tool speeds (n,) by adversary; catching_up arms are excluded."""
+    """Record the tool speeds (n,) of the arms by adversary, without arms that catch up."""
     for number, bridge in enumerate(bridges):
         under = tally.under[bridge.adversary]
         under.cycles += 1
         under.moved += bool(moving[number] > 0.0)
         if not catching_up[number]:
-            under.tool_speed_share = max(under.tool_speed_share, float(speed_share[number]))
+            under.tool_speed_ratio = max(under.tool_speed_ratio, float(speed_ratio[number]))
 
 
 def second_master(random: Random, geometry: ArmGeometry, joints_rad: Floats) -> SecondMaster:
@@ -806,7 +805,7 @@ def check_bridge(
 ) -> None:
     """Check a command of a bridge.
 
-    before: previous command (6,), rad; None if it did not move the arm.
+    before: previous command (6,), rad, or None if the previous command did not move the arm.
     """
     if command.mode != "move":
         return
@@ -849,7 +848,7 @@ def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) ->
     return {
         "commands": tally.commands + sheets.commands,
         "violations": {name: tally.violations[name] + sheets.violations[name] for name in names},
-        "worst_share": {
+        "worst_ratio": {
             name: round(max(tally.worst[name], sheets.worst[name]), 4) for name in names
         },
         "harder_braking": tally.expected,
@@ -858,7 +857,7 @@ def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) ->
             name: {
                 "cycles": under.cycles,
                 "moved": under.moved,
-                "tool_speed_share": round(under.tool_speed_share, 4),
+                "tool_speed_ratio": round(under.tool_speed_ratio, 4),
             }
             for name, under in sorted(sheets.under.items())
         },
@@ -876,7 +875,7 @@ def percentiles_us(times_ns: Sequence[int]) -> dict[str, float]:
 
 
 def run(commands: int, seed: int, *, searching: bool = True) -> dict[str, Any]:
-    """Run the benchmark with this number of commands; return its report.
+    """Run the benchmark with a number of commands, and return the report.
 
     searching: whether hypothesis searches for sequences of goals first.
     """
@@ -898,26 +897,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--commands", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="print one line of JSON")
     options = parser.parse_args()
     result = run(options.commands, options.seed)
-    if options.json:
-        print(json.dumps(result))
-    else:
-        print(f"{result['commands']} commands in {result['seconds']} s")
-        for name, count in result["violations"].items():
-            worst = result["worst_share"][name]
-            print(f"{name:26} {count:6} violations, worst {worst:.4f} of the limit")
-        print(f"{'braked harder (allowed)':26} {result['harder_braking']:6} commands")
-        print(f"{'thawed, second master':26} {result['excused_ms']:6} ms beyond the tool speed")
-        for name, under in result["under"].items():
-            print(
-                f"{name:26} {under['cycles']:6} cycles, {under['moved']} of them moved, "
-                f"tool speed {under['tool_speed_share']:.4f} of the limit"
-            )
-        for name, words in PASSES.items():
-            p50, p99 = result[name]["p50"], result[name]["p99"]
-            print(f"{words:40} p50 {p50:.0f} us, p99 {p99:.0f} us of the processor's time")
+    print(json.dumps(result, indent=1))
     return 1 if any(result["violations"].values()) else 0
 
 

@@ -35,6 +35,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from benchmarks.soak import start_busy_process
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.ports import choose_ports
@@ -70,7 +71,7 @@ MEASURED: dict[str, tuple[str, Callable[[Scene], float]]] = {
 
 
 class State(StrEnum):
-    """The worst state that occurred at a level; members are ordered from best to worst."""
+    """The worst state that occurred at a level. The members are ordered from best to worst."""
 
     WITHIN = "within_tolerance"
     OUT = "out_of_tolerance"
@@ -86,8 +87,9 @@ MARKERS = {State.WITHIN: "o", State.OUT: "s", State.HOLDS: "^", State.STOPS: "X"
 class Factor:
     """A quantity that is varied.
 
-    levels: values, in `unit`. key: path of the value in the scene file; None: it is not in the
-    scene. on_cables: whether it is a property of the arms' network cables.
+    levels: values, in `unit`.
+    key: path of the value in the scene file, or None if the scene does not contain the value.
+    on_cables: whether the quantity is a property of the network cables of the arms.
     """
 
     unit: str
@@ -124,7 +126,10 @@ def make_cable(factor: str, level: float) -> dict[str, float]:
 
 
 def write_scene(name: str, level: float, target: Path) -> Path:
-    """Write the demo's scene with a value of a factor; the factor stretch makes it constant."""
+    """Write the demo's scene with a value of a factor.
+
+    The factor "stretch" sets the minimum and the maximum stretch to the same value.
+    """
     yaml = YAML()
     values = yaml.load(SCENE_FILE.read_text())
     key = FACTORS[name].key
@@ -141,7 +146,7 @@ def write_scene(name: str, level: float, target: Path) -> Path:
 
 
 def run_level(name: str, level: float, seconds: float, folder: Path) -> dict[str, Any]:
-    """Run the demo with a value of a factor that is not on the network, and evaluate it."""
+    """Run and evaluate the demo with a value of a factor that is not on the network."""
     scene_file = write_scene(name, level, folder / "scene.yaml")
     launch_file = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml")
     bag = folder / "main.mcap"
@@ -171,7 +176,7 @@ def run_level(name: str, level: float, seconds: float, folder: Path) -> dict[str
 
 
 async def run_network_level(name: str, level: float, seconds: float) -> dict[str, Any]:
-    """Run three simulated computers with disturbed arm cables; evaluate the disturbed time."""
+    """Run three simulated computers with disturbed arm cables, and evaluate the disturbed time."""
     async with Lab() as lab:
         await lab.start_all()
         lab.stroke()
@@ -210,7 +215,7 @@ def evaluate_arms(
 ) -> dict[str, Any]:
     """Compute the sheet's error to its target, the arms' modes and violated limits in a time span.
 
-    host: host whose bags contain the states of both arms; None: the host of each arm.
+    host: host with the bags that contain the states of both arms; None: the host of each arm.
     """
     left, right = arms
     hold = measure_hold((left, right), wanted(folder), span)
@@ -243,7 +248,7 @@ def evaluate_arms(
 
 
 def read_value(row: Mapping[str, Any], key: str) -> float | None:
-    """Return the value at a key such as "sheet_mm.p95"; None if the row does not contain it."""
+    """Return the value at a key such as "sheet_mm.p95", or None without such a value."""
     outer, _, inner = key.partition(".")
     found = row.get(outer)
     value = found.get(inner) if isinstance(found, dict) else None
@@ -277,7 +282,7 @@ def measure_factor(
     folder: Path,
     run: Callable[[str, float, float], dict[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Return the rows of all levels of a factor; run only those without a result in the folder."""
+    """Return the rows of all levels of a factor. Levels with a result in the folder are not run."""
     own = folder / name
     open_sweep(own, {"factor": name, "seconds": seconds})
     names = {f"level-{level:g}": level for level in levels}
@@ -317,7 +322,7 @@ def run_one(name: str, level: float, seconds: float) -> dict[str, Any]:
 
 
 def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the ratios of errors and latency to their tolerances; markers show the states."""
+    """Draw the ratios of errors and latency to the tolerances. Markers show the states."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -363,26 +368,6 @@ def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         save_svg(figure, path)
 
 
-def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table with one line per level, in Markdown."""
-    lines = [
-        "| factor | level | state | followed | " + " | ".join(MEASURED) + " | violations |",
-        "|---" * (5 + len(MEASURED)) + "|",
-    ]
-    for row in rows:
-        values = [read_value(row, key) for key in MEASURED]
-        cells = [
-            row["factor"],
-            f"{row['level']:g} {row['unit']}",
-            row["state"],
-            f"{row['followed']:.0%}" if "followed" in row else "-",
-            *("-" if value is None else f"{value:.2f}" for value in values),
-            ", ".join(row.get("violations", ())) or "-",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
 def select_levels(factor: Factor, *, quick: bool) -> tuple[float, ...]:
     """Return all levels of a factor, or with `quick` the first and the last one."""
     return (factor.levels[0], factor.levels[-1]) if quick else factor.levels
@@ -414,7 +399,11 @@ def main() -> int:
     report = {"machine": machine_name(), "cores": os.cpu_count(), "rows": rows}
     write_file(given.output / "load.json", json.dumps(replace_non_finite(report), indent=1) + "\n")
     draw_rows(rows, given.output / "load.svg")
-    print(json.dumps(replace_non_finite(report), indent=1) if given.json else format_table(rows))
+    if given.json:
+        print(json.dumps(replace_non_finite(report), indent=1))
+    else:
+        shown = ("factor", "level", "unit", "state", "followed", "tolerance_ratios", "violations")
+        print_rows([{key: row.get(key) for key in shown} for row in rows], as_json=False)
     bad = any(row.get("violations") or row["state"] == State.FAILED.value for row in rows)
     return 1 if bad else 0
 

@@ -1,6 +1,6 @@
 """Measure the time of a message from one process to another, by the method of receiving.
 
-python -m benchmarks.messaging [--quick] [--transport ipc|tcp] [--json FILE] [--markdown FILE]
+python -m benchmarks.messaging [--quick] [--transport ipc|tcp] [--json]
 
 One process publishes at a constant rate, and one process per design receives; one design is within
 a single process. The latency is the one-way time on the shared clock, from before a typed message
@@ -19,11 +19,10 @@ import json
 import multiprocessing
 import os
 import random
-import sys
 import tempfile
 import time
 import timeit
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
@@ -36,8 +35,8 @@ import zmq
 import zmq.asyncio
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Publisher, Subscriber
@@ -45,6 +44,7 @@ from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import Fingertip, StereoPair
 from flexsheet.messages.wire import INLINE_BYTES, count_bytes, decode, encode
+from flexsheet.nodes.node import PortCounts
 
 FLOOR = "blocking"
 ONE_PROCESS = "flexsheet, one process"
@@ -76,9 +76,8 @@ class Payload:
 class Design:
     """A method of receiving messages.
 
-    typed: whether it returns validated messages; other designs return bytes.
-
-    open: opens its sending end; None: a publisher of `flexsheet.messages.bus`.
+    typed: whether the receiver gets validated messages. Other designs receive bytes.
+    open: function that opens the sending end; None: a publisher of `flexsheet.messages.bus`.
     """
 
     name: str
@@ -87,13 +86,6 @@ class Design:
     receive: Callable[[Topic, str, Callable[[int, int], bool]], None]
     inline_bytes: int | None = None
     open: Callable[[Payload, str], Line] | None = None
-
-
-@dataclass
-class Counts:
-    dropped: int = 0
-    gaps: int = 0
-    rejected: int = 0
 
 
 def subscriber_socket(context: Any, endpoint: str) -> Any:
@@ -175,7 +167,7 @@ async def subscribe(topic: Topic, endpoint: str, arrived: Callable[[int, int], b
         if not arrived(header.sequence, header.publish_ns) and not ended.done():
             ended.set_result(None)
 
-    subscriber = Subscriber(topic, [endpoint], on_message, Counts())
+    subscriber = Subscriber(topic, [endpoint], on_message, PortCounts())
     subscriber.start()
     await ended
     subscriber.close()
@@ -208,7 +200,7 @@ DESIGNS = (
 
 
 def refuse_receiver(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
-    """Raise RuntimeError, since this design has no receiving process."""
+    """Raise RuntimeError, because this design has no receiving process."""
     raise RuntimeError(f'"{ONE_PROCESS}" has no receiving process')
 
 
@@ -412,7 +404,7 @@ class LocalSender:
         def on_message(message: Message, header: Header) -> None:
             latencies.append(time.monotonic_ns() - header.publish_ns)
 
-        subscriber = Subscriber(topic, [self._endpoint], on_message, Counts(), local=local)
+        subscriber = Subscriber(topic, [self._endpoint], on_message, PortCounts(), local=local)
         subscriber.start()
         next_s = time.monotonic()
         for number in range(1, count + LOCAL_WARM_UP + 1):
@@ -446,7 +438,7 @@ def opener(transport: str, folder: Path) -> Callable[[Design, Payload, int], Sen
 
 
 def percentile_us(latencies_ns: Sequence[int], percent: float) -> float:
-    """Return a percentile in us; NaN without messages."""
+    """Return a percentile in us, or NaN without messages."""
     if not latencies_ns:
         return float("nan")
     return float(np.percentile(np.asarray(latencies_ns), percent)) * 1e-3
@@ -460,10 +452,12 @@ def measure(
     seconds: float,
     open_sender: Callable[[Design, Payload, int], Sender | LocalSender],
     step: Callable[[], object],
+    reference: str = FLOOR,
 ) -> list[dict[str, Any]]:
-    """Return one row per design: medians over rounds of p50, p99 and their ratios to ZeroMQ.
+    """Return one row per design: medians over rounds of p50, p99 and their ratios to a reference.
 
-    open_sender: its third argument is the design's index.
+    open_sender: function of the design, the payload and the index of the design.
+    reference: name of a design.
     """
     count = round(seconds * payload.rate_hz)
     senders: list[Sender | LocalSender] = []
@@ -485,7 +479,7 @@ def measure(
     finally:
         for sender in senders:
             sender.close()
-    floor = by_design[FLOOR]
+    floor = by_design[reference]
 
     def row(design: Design) -> dict[str, Any]:
         p50s, p99s = zip(*by_design[design.name], strict=True)
@@ -540,103 +534,13 @@ def codec_costs() -> list[dict[str, Any]]:
     return rows
 
 
-LATENCY_HEADS = (
-    "design",
-    "",
-    "p50 µs",
-    "p99 µs",
-    "p50 ratio",
-    "(min-max)",
-    "p99 ratio",
-    "superseded",
-)
-CODEC_HEADS = ("message", "frames", "bytes", "construct µs", "encode µs", "decode µs")
-
-
-def latency_cells(row: dict[str, Any]) -> tuple[str, ...]:
-    low, high = row["p50_ratio_range"]
-    figures: tuple[str, ...] = (
-        f"{row['p50_us']:.0f}",
-        f"{row['p99_us']:.0f}",
-        f"{row['p50_ratio']:.2f}",
-        f"{low:.2f}-{high:.2f}",
-        f"{row['p99_ratio']:.2f}",
-    )
-    if np.isnan(row["p50_us"]):
-        figures = ("-",) * len(figures)
-    return row["design"], row["about"], *figures, f"{row['superseded']}"
-
-
-def codec_cells(row: dict[str, Any]) -> tuple[str, ...]:
-    times = (f"{row[key]:.1f}" for key in ("construct_us", "encode_us", "decode_us"))
-    return row["payload"], f"{row['frames']}", f"{row['bytes']}", *times
-
-
-def tables(
-    report: dict[str, Any],
-) -> Iterator[tuple[str, tuple[str, ...], list[tuple[str, ...]]]]:
-    """Return title, headings and rows of each table."""
-    for payload in PAYLOADS:
-        rows = [latency_cells(row) for row in report["latency"] if row["payload"] == payload.name]
-        title = f"{payload.name} at {payload.rate_hz:.0f} Hz, one way, {report['transport']}"
-        yield title, LATENCY_HEADS, rows
-    yield "In one process, warm", CODEC_HEADS, [codec_cells(row) for row in report["codec"]]
-
-
-def print_tables(report: dict[str, Any], console: Console) -> None:
-    for title, heads, rows in tables(report):
-        table = Table(title=title, title_justify="left")
-        for number, head in enumerate(heads):
-            table.add_column(head, justify="left" if number == 0 or not head else "right")
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
-
-
-def format_ratios(report: dict[str, Any], design: str = NODES_USE) -> str:
-    """Format the ratios of a design; the default is the design that nodes use."""
-    return "; ".join(
-        f"{row['payload']} {row['p50_ratio']:.2f} at p50, {row['p99_ratio']:.2f} at p99"
-        for row in report["latency"]
-        if row["design"] == design
-    )
-
-
-def markdown(report: dict[str, Any]) -> str:
-    """Return the report as Markdown."""
-    lines = [
-        "# How long a message takes",
-        "",
-        f"<!-- Written by `{report['command']}`. -->",
-        "",
-        *(__doc__ or "").split("\n\n")[2].strip().splitlines(),
-        "",
-        f"Command: `{report['command']}`.  Machine: {report['machine']}, ZeroMQ {report['zmq']}; "
-        f"load average {report['load'][0]:.1f} before and {report['load'][1]:.1f} after.  "
-        f"{report['rounds']} rounds; ratios are medians over the rounds of the ratio to "
-        f'"{FLOOR}" within the round.  Superseded: dropped for a newer one while the receiver '
-        "waited for its turn.  A load above the number of cores means that other work shared them, "
-        "and p99 is then mostly its doing.",
-        "",
-        "To reach (a typed, validated message against raw blocking ZeroMQ): fingertip 1.50 at p50, "
-        f"1.30 at p99; stereo pair 1.20.  Reached in this run: {format_ratios(report)}.  Within "
-        f"one process, to reach 0.20: {format_ratios(report, ONE_PROCESS)}.",
-    ]
-    for title, heads, rows in tables(report):
-        lines += ["", f"## {title}", ""]
-        for cells in (heads, tuple("---" for _ in heads), *rows):
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="2 rounds of 1 s: under a minute")
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=2.0, help="per design and round")
     parser.add_argument("--transport", choices=["ipc", "tcp"], default="ipc")
-    parser.add_argument("--json", type=Path, help="JSON file to write")
-    parser.add_argument("--markdown", type=Path, help="Markdown file to write")
+    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     rounds, seconds = (2, 1.0) if options.quick else (options.rounds, options.seconds)
     words = Console(stderr=True)
@@ -655,8 +559,6 @@ def main() -> None:
                 step=lambda: progress.advance(task),
             )
     report = {
-        "command": f"python -m benchmarks.messaging --transport {options.transport} "
-        f"--rounds {rounds} --seconds {seconds:g} --markdown messaging.md",
         "machine": machine_name(),
         "load": [load_before, os.getloadavg()[0]],
         "zmq": zmq.zmq_version(),
@@ -665,11 +567,17 @@ def main() -> None:
         "latency": latency,
         "codec": codec_costs(),
     }
-    if options.json is not None:
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
-    if options.markdown is not None:
-        options.markdown.write_text(markdown(report))
-    print_tables(report, Console(file=sys.stdout))
+    print_report(report, "latency", "codec", as_json=options.json)
+
+
+def print_report(report: dict[str, Any], *tables: str, as_json: bool) -> None:
+    """Print a report as JSON, or the rows of some of its entries as tables."""
+    if as_json:
+        print(json.dumps(report, indent=1))
+        return
+    for name in tables:
+        print_rows(report[name], as_json=False)
+        print()
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
 """Measure the time of a message by flexsheet and by other messaging libraries, in the same run.
 
 make bench-peers
-python -m benchmarks.messaging_peers [--quick] [--over ipc tcp veth] [--json FILE]
-    [--markdown FILE]
+python -m benchmarks.messaging_peers [--quick] [--over ipc tcp veth] [--json]
 
 As in `benchmarks.messaging`, one process publishes at a constant rate, and one process per library
 receives; results are ratios to blocking ZeroMQ within a round. zenoh and dora transfer as many
@@ -19,10 +18,8 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -40,18 +37,13 @@ from rich.progress import Progress
 from benchmarks import keys, messaging, peers
 from benchmarks.messaging import FLOOR, NODES_USE, PAYLOADS, BusLine, Design, Line, Payload, Sender
 from flexsheet.launch.methods.results import machine_name
-from flexsheet.messages.security import KeyRing
 
 CLONE_NEWNET = 0x40000000
 ADDRESSES = ("10.78.0.1", "10.78.0.2")
 DEVICE = "bench"
 PORTS = count(7450)
 DOMAINS = count(1)
-OVER = {
-    "ipc": "within a computer, by ipc where there is such a thing",
-    "tcp": "on loopback, by tcp or UDP",
-    "veth": "between two networks, by tcp or UDP",
-}
+OVER = ("ipc", "tcp", "veth")
 
 
 @dataclass(frozen=True)
@@ -109,25 +101,6 @@ PEERS = (
 )
 
 
-class KeyedLine(BusLine):
-    """A publisher with keys, which needs a running event loop."""
-
-    def __init__(self, payload: Payload, place: str, ring: KeyRing, loop: keys.Loop) -> None:
-        super().__init__(
-            OURS_KEYED,
-            payload,
-            place,
-            lambda topic, at: loop.do(keys.open_for_thread(topic, at, ring)),
-        )
-        self._loop = loop
-
-    def close(self) -> None:
-        async def closed() -> None:
-            self._publisher.close()
-
-        self._loop.do(closed())
-
-
 OURS = Design(NODES_USE, "typed, validated", True, messaging.flexsheet_uvloop)
 OURS_KEYED = Design(NODES_USE, "typed, validated, CURVE", True, keys.listen)
 RAW = Design(FLOOR, "raw ZeroMQ: the floor", False, messaging.blocking)
@@ -140,13 +113,16 @@ def _libc(call: str, *arguments: int) -> None:
 
 
 def enter_network(pid: int) -> None:
-    """Enter the network namespace of a process; call this function before a socket is opened."""
+    """Enter the network namespace of a process. Must be called before a socket is opened."""
     with open(f"/proc/{pid}/ns/net") as space:
         _libc("setns", space.fileno(), CLONE_NEWNET)
 
 
 def leave_for_own_network() -> None:
-    """Enter a new network namespace with loopback multicast; raises OSError without permission."""
+    """Enter a new network namespace with loopback multicast.
+
+    Raises OSError without permission.
+    """
     _libc("unshare", CLONE_NEWNET)
     _ip("link", "set", "lo", "up", "multicast", "on")
     _ip("route", "add", "224.0.0.0/4", "dev", "lo")
@@ -154,7 +130,7 @@ def leave_for_own_network() -> None:
 
 @contextmanager
 def second_network() -> Iterator[int]:
-    """Create a network namespace connected by a virtual cable; yield a process in it."""
+    """Create a network namespace with a virtual cable, and yield the id of a process in it."""
     holder = subprocess.Popen(
         ["unshare", "--net", "sh", "-c", "echo here; exec cat"],
         stdin=subprocess.PIPE,
@@ -216,7 +192,7 @@ def measure_over(
             if design.name == FLOOR:
                 return peers.ZmqLine(payload, place)
             if over == "veth":
-                return KeyedLine(payload, place, ring, loop)
+                return keys.KeyedLine(payload, place, ring, loop)
             return BusLine(design, payload, place)
 
         rows = []
@@ -234,46 +210,13 @@ def measure_over(
     return [{"over": over, **row} for row in rows]
 
 
-HEADS = ("library", "", "p50 µs", "p99 µs", "p50 ratio", "(min-max)", "p99 ratio", "lost")
-
-
-def markdown(report: dict[str, Any]) -> str:
-    """Return the report as Markdown."""
-    lines = [
-        "# How long a message takes by other libraries",
-        "",
-        f"<!-- Written by `{report['command']}`. -->",
-        "",
-        *"\n\n".join((__doc__ or "").split("\n\n")[2:]).strip().splitlines(),
-        "",
-        f"Command: `{report['command']}`.  Machine: {report['machine']}, ZeroMQ {report['zmq']}, "
-        + ", ".join(f"{name} {number}" for name, number in report["packages"].items())
-        + f"; load average {report['load'][0]:.1f} before and {report['load'][1]:.1f} after.  "
-        f"{report['rounds']} rounds; ratios are medians over the rounds.  Lost: never arrived, or "
-        "superseded by a newer one while the receiver waited for its turn.",
-        *(["", f"Left out: {'; '.join(report['left_out'])}."] if report["left_out"] else []),
-    ]
-    for over in report["over"]:
-        for payload in PAYLOADS:
-            lines += ["", f"## {payload.name} at {payload.rate_hz:.0f} Hz, {OVER[over]}", ""]
-            rows = [
-                messaging.latency_cells(row)
-                for row in report["latency"]
-                if (row["over"], row["payload"]) == (over, payload.name)
-            ]
-            for cells in (HEADS, tuple("---" for _ in HEADS), *rows):
-                lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="2 rounds of 1 s")
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=1.5, help="per library and round")
-    parser.add_argument("--over", nargs="+", choices=list(OVER), default=list(OVER))
-    parser.add_argument("--json", type=Path, help="JSON file to write")
-    parser.add_argument("--markdown", type=Path, help="Markdown file to write")
+    parser.add_argument("--over", nargs="+", choices=OVER, default=OVER)
+    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if options.quick:
         options.rounds, options.seconds = 2, 1.0
@@ -301,8 +244,6 @@ def main() -> None:
         for one in over:
             latency += measure_over(one, found, options, lambda: progress.advance(task))
     report = {
-        "command": f"python -m benchmarks.messaging_peers --rounds {options.rounds} "
-        f"--seconds {options.seconds:g} --markdown messaging-peers.md",
         "machine": machine_name(),
         "load": [load_before, os.getloadavg()[0]],
         "zmq": zmq.zmq_version(),
@@ -312,12 +253,7 @@ def main() -> None:
         "rounds": options.rounds,
         "latency": latency,
     }
-    if options.json is not None:
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
-    page = markdown(report)
-    if options.markdown is not None:
-        options.markdown.write_text(page)
-    sys.stdout.write(page)
+    messaging.print_report(report, "latency", as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -11,10 +11,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from flexsheet.nodes.arrays import Floats, Ints
 
 SUBDIVISIONS = 3
 HALF_MM = (62.0, 42.0, 30.0)
@@ -23,7 +21,7 @@ TAPER_Y, TAPER_Z = 0.2, 0.25
 FURROW_AT, FURROW_WIDTH, FURROW_MM = 0.2, 0.3, 4.0
 
 
-def organ_mesh() -> tuple[Floats, Indices]:
+def organ_mesh() -> tuple[Floats, Ints]:
     """Return vertices (v, 3) in mm and triangles (t, 3), counter-clockwise seen from outside."""
     # Imported late: only the generator needs it.
     import trimesh
@@ -42,7 +40,7 @@ def organ_mesh() -> tuple[Floats, Indices]:
     return vertices, np.asarray(ball.faces, dtype=np.int64)
 
 
-def obj_text(vertices: Floats, triangles: Indices) -> str:
+def obj_text(vertices: Floats, triangles: Ints) -> str:
     """Format the mesh as a Wavefront OBJ file, with a resolution of 0.01 units."""
     lines = ["# made by python -m benchmarks.organ; millimetres"]
     lines += [f"v {x:.2f} {y:.2f} {z:.2f}" for x, y, z in vertices]

@@ -111,11 +111,11 @@ nodes:
   - {id: sender, path: dynamic, outputs: [message]}
   - {id: receiver, path: dynamic, inputs: {message: {source: sender/message, queue_size: 1000}}}
 """
-"""The dataflow of dora; its nodes are processes of this benchmark."""
+"""The dataflow of dora. The nodes are processes of this benchmark."""
 
 
 def dora_node(name: str) -> Any:
-    """Return a node of the dataflow; retry until its daemon is ready."""
+    """Connect to the daemon as a node of the dataflow. Retry until the daemon is ready."""
     from dora import Node
 
     patience_ends = time.monotonic() + DORA_STARTS_S
@@ -212,7 +212,7 @@ def dds_types() -> dict[type, type]:
 
 
 def dds_participant(endpoint: str) -> tuple[Any, Any]:
-    """Create a DDS domain on one interface without multicast, and a participant in it.
+    """Create a DDS domain on one interface without multicast, and a participant.
 
     endpoint: number of the domain, name of the interface, and the address of each end.
     """

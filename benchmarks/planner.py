@@ -19,21 +19,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from benchmarks.planner_methods import ellipsoid_mesh
+from benchmarks.planner_methods import ellipsoid_mesh, sample_geodesic
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Mesh, Pose, Scene
 from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import angle_between
 from flexsheet.nodes.models.shapes import Shape, make_shape
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
-
-Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 CYCLE_S = 7.1e-3
@@ -43,11 +41,10 @@ PHASES = ("approach", "contact", "hold")
 SPEEDS_M_PER_S = np.geomspace(0.004, 0.2, 24)
 WAY_M = 0.016
 GOOD_DEG = 0.5
-FRONT = np.array([0.0, 0.0, 1.0])
 
 
 def geometries() -> dict[str, Mapping[str, Any]]:
-    """Return geometries by name; the mesh is that of an ellipsoid unless a file is given."""
+    """Return geometries by name. The mesh represents an ellipsoid, unless a file is given."""
     named: dict[str, Mapping[str, Any]] = {
         "cylinder": {"shape": "cylinder", "radius_m": 0.0353553, "length_m": 0.12},
         "sphere": {"shape": "sphere", "radius_m": 0.05},
@@ -103,25 +100,10 @@ def make_compliance(scene: Scene) -> ComplianceController:
 
 
 def copy_planner(plan: SheetTrajectoryPlanner) -> SheetTrajectoryPlanner:
-    """Copy a plan in its initial state; to make a plan for a mesh takes a second."""
+    """Copy a planner in its initial state, because making a planner for a mesh takes a second."""
     other = copy.copy(plan)
     other._contact_state = copy.copy(plan._contact_state)  # it changes by assignment only
     return other
-
-
-def sample_geodesic(
-    shape: Shape, heading: Floats, step_m: float, steps: int
-) -> tuple[Floats, Floats]:
-    """Return points and normals (n, 3) along a geodesic from the front."""
-    found = shape.closest(10.0 * FRONT)
-    way = [(found.point, found.normal)]
-    for _ in range(steps):
-        heading = heading - found.normal * (found.normal @ heading)
-        heading = heading / np.linalg.norm(heading)
-        found = shape.closest(found.point + step_m * heading, previous=found.point)
-        way.append((found.point, found.normal))
-    points, normals = (np.array(part) for part in zip(*way, strict=True))
-    return points, normals
 
 
 def make_session(shape: Shape) -> Floats:

@@ -18,11 +18,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.methods.charts import make_chart_result, measure_family, write_chart
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.methods import Case, Family, Trial
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.models.shapes import (
@@ -43,8 +43,6 @@ from flexsheet.nodes.planner.rolling import (
 )
 from tests.facets import Facets
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 NormalAt = Callable[[Floats], Floats]
 """The function from points (n, 3) to the unit normals (n, 3) of the nearest surface points."""
 
@@ -55,7 +53,7 @@ MAX_EDGE_RATIO = 0.35
 """The maximum ratio of median edge length to smallest radius of curvature for the jet methods."""
 
 
-def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Indices]:
+def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Ints]:
     """Return vertices (v, 3) on the ellipsoid, and triangles (t, 3), of a scaled icosphere."""
     # Imported late: only benchmarks need it.
     import trimesh
@@ -64,13 +62,13 @@ def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Indices]:
     return np.asarray(ball.vertices) * SEMI_AXES_M, np.asarray(ball.faces, dtype=np.int64)
 
 
-def facet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
+def facet_normals(vertices: Floats, triangles: Ints) -> NormalAt:
     """Return a function that computes the normal of the nearest triangle."""
     facets, normals = Facets(vertices, triangles), triangle_normals(vertices, triangles)
     return lambda points: np.asarray(normals[facets.nearest(points)[0]])
 
 
-def blended_normals(vertices: Floats, triangles: Indices) -> NormalAt:
+def blended_normals(vertices: Floats, triangles: Ints) -> NormalAt:
     """Return a function that interpolates the normals of vertices (Phong 1975)."""
     facets, normals = Facets(vertices, triangles), vertex_normals(vertices, triangles)
 
@@ -82,13 +80,13 @@ def blended_normals(vertices: Floats, triangles: Indices) -> NormalAt:
     return normal_at
 
 
-def jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
+def jet_normals(vertices: Floats, triangles: Ints) -> NormalAt:
     """Return a function that computes normals by `SmoothMeshShape` without a previous point."""
     shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     return lambda points: shape.closest(points).normal
 
 
-def followed_jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
+def followed_jet_normals(vertices: Floats, triangles: Ints) -> NormalAt:
     """Return a function like `jet_normals` that starts from a previous point 0.3 mm away."""
     shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     earlier: dict[bytes, Floats] = {}
@@ -102,7 +100,7 @@ def followed_jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
     return normal_at
 
 
-NORMAL_METHODS: dict[str, Callable[[Floats, Indices], NormalAt]] = {
+NORMAL_METHODS: dict[str, Callable[[Floats, Ints], NormalAt]] = {
     "facets": facet_normals,
     "blended": blended_normals,
     "jets": jet_normals,
@@ -228,16 +226,25 @@ ROLLING_METHODS: dict[str, RollStep] = {
 }
 
 
-def make_stroke(shape: Shape, step_m: float) -> Floats:
-    """Return fingers (n, 3) along a geodesic from the front, oblique to the sheet's axes."""
+def sample_geodesic(
+    shape: Shape, heading: Floats, step_m: float, steps: int
+) -> tuple[Floats, Floats]:
+    """Return points and normals (n, 3) along a geodesic from the front of a shape."""
     found = shape.closest(10.0 * FRONT)
-    heading, fingers = HEADING, [found.point - STROKE_DEPTH_M * found.normal]
-    for _ in range(round(STROKE_M / step_m)):
+    path = [(found.point, found.normal)]
+    for _ in range(steps):
         heading = heading - found.normal * (found.normal @ heading)
         heading = heading / np.linalg.norm(heading)
         found = shape.closest(found.point + step_m * heading, previous=found.point)
-        fingers.append(found.point - STROKE_DEPTH_M * found.normal)
-    return np.array(fingers)
+        path.append((found.point, found.normal))
+    points, normals = (np.array(part) for part in zip(*path, strict=True))
+    return points, normals
+
+
+def make_stroke(shape: Shape, step_m: float) -> Floats:
+    """Return fingers (n, 3) along a geodesic from the front, oblique to the sheet's axes."""
+    points, normals = sample_geodesic(shape, HEADING, step_m, round(STROKE_M / step_m))
+    return np.asarray(points - STROKE_DEPTH_M * normals)
 
 
 def roll_along(step: RollStep, shape: Shape, fingers: Floats) -> SheetContact:

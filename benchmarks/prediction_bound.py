@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.hand_motion import (
     GRID_HZ,
@@ -29,13 +28,13 @@ from benchmarks.hand_motion import (
 )
 from benchmarks.tracking_bench import bench_scene
 from benchmarks.tracking_regret import autocovariance, marker_covariance
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.experiments.robustness import apparatus_text, parse_seeds
 from flexsheet.launch.plans.apparatus import load_apparatus
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.tolerance_table import Profile
-
-Floats = NDArray[np.float64]
 
 NOISE_PX = 0.02
 """Noise of the marker's centre in simulated strokes, px."""
@@ -103,11 +102,8 @@ def main() -> None:
     result = measure(parse_seeds(given.seeds), given.profile)
     if given.json:
         print(json.dumps(result))
-        return
-    for row in result["rows"]:
-        print(f"seed {row['seed']}: {row['sheet_mm']:.3f} mm")
-    overall = result["sheet_mm"]
-    print(f"median {overall['median']:.3f} mm, 95 % {overall['p95']:.3f} mm")
+    else:
+        print_rows([*result["rows"], result["sheet_mm"]], as_json=False)
 
 
 if __name__ == "__main__":

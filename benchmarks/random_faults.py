@@ -93,7 +93,10 @@ class Fault:
 def draw_fault(
     rng: random.Random, nodes: dict[str, list[str]], kinds: Sequence[FaultKind] = tuple(FaultKind)
 ) -> Fault:
-    """Draw a fault; nodes: name of one node per process, by host."""
+    """Draw a fault.
+
+    nodes: name of one node per process, by host.
+    """
     kind = rng.choice(kinds)
     host = "main" if kind is FaultKind.DISK_FULL else rng.choice(HOSTS)
     of_a_node = kind in (FaultKind.NODE_KILLED, FaultKind.NODE_SUSPENDED)
@@ -102,7 +105,7 @@ def draw_fault(
 
 
 async def inject(lab: Lab, fault: Fault, span: Span) -> None:
-    """Cause a fault and end it; return when the killed processes run again."""
+    """Cause and end a fault, and wait until killed processes run again."""
     match fault.kind:
         case FaultKind.NODE_KILLED:
             assert fault.node is not None
@@ -303,7 +306,7 @@ async def restore(lab: Lab) -> None:
 
 
 async def run_random(given: argparse.Namespace) -> int:
-    """Draw faults for `given.minutes` and print a report; return 1 if there are violations."""
+    """Draw faults for `given.minutes`, and print a report. Return 1 if there are violations."""
     rng = random.Random(given.seed)
     kinds = [kind for kind in FaultKind if given.only in kind.value]
     load = os.getloadavg()
@@ -400,7 +403,7 @@ def evaluate(lab: Lab, results: list[Result], watch: ProcessMonitor) -> dict[str
 
 
 def percentiles(values: list[float]) -> dict[str, float] | None:
-    """Return median, 95 % and maximum; None without values."""
+    """Return median, 95 % quantile and maximum, or None without values."""
     if not values:
         return None
     p50, p95 = np.percentile(values, (50.0, 95.0))

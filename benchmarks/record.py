@@ -27,7 +27,7 @@ MISSED_EXIT_CODE = 1
 
 
 def record(name: str, command: Sequence[str], folder: Path = RESULTS) -> Path:
-    """Run a command that prints JSON; return the file with its output and the circumstances.
+    """Run a command that prints JSON, and write the output to a file with machine and commit.
 
     The command may exit with 0 or `MISSED_EXIT_CODE`. Raises CalledProcessError for another exit
     code, and JSONDecodeError for an output that is not JSON.

@@ -1,6 +1,6 @@
 """Measure start-up time, processor time and memory of the graph of each shipped scene.
 
-python -m benchmarks.scenes [--scene NAME ...] [--seconds 20] [--json FILE] [--markdown]
+python -m benchmarks.scenes [--scene NAME ...] [--seconds 20]
 
 Each scene runs with the nodes of `launch/demo.yaml`, rigid-plane with `launch/rigid.yaml`. The
 simulated finger moves in circles on the object, while processor time and memory of each process are
@@ -42,7 +42,7 @@ GESTURE = "circle"
 APPROACH_S = 3.0
 POLL_S = 0.01
 SOFT_BODY_S = 600.0
-"""The maximum time to wait for the first soft body, whose precomputation may not be cached."""
+"""The maximum time (s) to wait for the first soft body, with precomputation."""
 
 
 def write_launch_file(folder: Path, scene: str) -> Path:
@@ -72,7 +72,7 @@ async def measure_start_s(plan: ResolvedGraph) -> float:
 
 
 async def wait_ready(graph: RunningGraph, processes: dict[str, list[str]]) -> dict[str, float]:
-    """Wait until all nodes are ready; return the processor time that each process took, s."""
+    """Wait until all nodes are ready, and return the processor time (s) of each process."""
     used: dict[str, float] = {}
     ready = asyncio.create_task(graph.wait_ready())
     while len(used) < len(processes) and not (ready.done() and ready.exception()):
@@ -180,14 +180,10 @@ def main() -> None:
     names = sorted(path.stem for path in SCENES.glob("*.yaml"))
     parser.add_argument("--scene", nargs="+", choices=names, default=names)
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--json", type=Path, help="JSON file to write")
-    parser.add_argument("--markdown", action="store_true", help="print a table in Markdown")
     options = parser.parse_args()
     rows = [run_scene(scene, options.seconds) for scene in options.scene]
     report = {"machine": machine_name(), "seconds": options.seconds, "scenes": rows}
-    if options.json is not None:
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
-    print(format_markdown(rows) if options.markdown else json.dumps(report, indent=1))
+    print(json.dumps(report, indent=1))
 
 
 if __name__ == "__main__":

@@ -42,9 +42,9 @@ from typing import Any
 
 import numpy as np
 import psutil
-from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.experiments import image
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.gestures import gesture_path
@@ -67,8 +67,7 @@ from flexsheet.messages.types import (
     Recording,
     Status,
 )
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 SAMPLE_S = 10.0
 WARM_UP_S = 600.0
@@ -76,7 +75,10 @@ WARM_UP_SHARE = 0.25
 """The warm-up of a short run, as a fraction of its duration."""
 
 MIN_FIT_S = 900.0
-"""The minimum duration for slopes in seconds; in less time, caches that fill look like leaks."""
+"""The minimum duration for slopes in seconds.
+
+In a shorter time, caches that fill look like leaks.
+"""
 
 READER_NICE = 15
 
@@ -96,8 +98,8 @@ MIB = 1 << 20
 class Sample:
     """Resources of a process at one time.
 
-    uss: private memory. A proportional share would hide a leak, since it falls when others load the
-        same libraries.
+    uss: private memory. The proportional memory would hide a leak, because it decreases when other
+        processes load the same libraries.
     """
 
     time_s: float
@@ -149,7 +151,10 @@ class StatusTotals:
     _before: dict[str, Status] = field(default_factory=dict)
 
     def take(self, status: Status, header: Header) -> None:
-        """Add the changes since the node's last status; counters of a new process start at 0."""
+        """Add the changes since the last status of the node.
+
+        The counters of a new process start at 0.
+        """
         before = self._before.get(status.node)
         self._before[status.node] = status
         if before is None:
@@ -172,7 +177,7 @@ class StatusTotals:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Results of one bag; latencies in ms from mid-exposure, percentiles 50 and 99."""
+    """The results of one bag. Latencies (ms) count from mid-exposure, at percentiles 50 and 99."""
 
     begin_ns: int
     seconds: float
@@ -261,8 +266,10 @@ def paths(scene: Scene) -> Iterator[FingerPath]:
 class Soak:
     """One run of the graph: its samples, its windows, and the nodes' totals.
 
-    seconds: duration of the stroking. window_s: duration of each bag. folder: for bags and report.
-        busy: number of other processes that compute.
+    seconds: duration of the strokes.
+    window_s: duration of each bag.
+    folder: folder for bags and report.
+    busy: number of other processes that compute.
     """
 
     def __init__(
@@ -292,7 +299,7 @@ class Soak:
         self._cpu_s: dict[int, float] = {}
 
     async def run(self) -> None:
-        """Run the graph for the duration; record a premature end in `problems`."""
+        """Run the graph for the duration. A premature end is recorded in `problems`."""
         scene = self.plan.scene_message()
         assert scene is not None  # the demo has one
         precompute_graph(self.plan, say)
@@ -405,7 +412,7 @@ class Soak:
     async def _read_bags(self, *, all_of_them: bool = False) -> None:
         """Evaluate the complete bags in a process with low priority, and remove them.
 
-        The newest bag is incomplete until the end of the run; it is then evaluated but not removed.
+        The newest bag is complete only at the end of the run. It is not removed.
         """
         bags = sorted(self.folder.glob("soak-*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
         context = multiprocessing.get_context("spawn")
@@ -433,7 +440,7 @@ def lower_priority() -> None:
 
 
 def slope(times_s: Floats, values: Floats) -> Slope | None:
-    """Return the median slope of all pairs (Theil, Sen); None if the time is too short."""
+    """Return the median slope of all pairs (Theil, Sen), or None if the time is too short."""
     if times_s[-1] - times_s[0] < MIN_FIT_S:
         return None
     found = theilslopes(values, times_s / 3600.0)
@@ -578,124 +585,32 @@ def drifts(windows: Sequence[dict[str, Any]]) -> list[str]:
     return found
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in lines)
-
-
-def to_markdown(result: dict[str, Any]) -> str:
-    """Format the report as Markdown."""
-
-    def mib(value: float) -> str:
-        return f"{value / MIB:.1f}"
-
-    def growth(process: dict[str, Any], name: str) -> str:
-        rate = process[name]["slope_per_h"]
-        if rate is None:
-            return "–"
-        low, high = rate["low_per_h"] / MIB, rate["high_per_h"] / MIB
-        return f"{rate['per_h'] / MIB:+.2f} ({low:+.2f} to {high:+.2f})"
-
-    def both(pair: tuple[float, float] | None) -> str:
-        return "–" if pair is None else f"{pair[0]:.1f} / {pair[1]:.1f}"
-
-    def share(value: float | None) -> str:
-        return "–" if value is None else f"{100.0 * value:.1f} %"
-
-    def steady(process: dict[str, Any], name: str) -> str:
-        return f"{process[name]['settled']:g} → {process[name]['end']:g}"
-
+def print_report(result: dict[str, Any]) -> None:
+    """Print the report as tables, and the findings."""
     processes = [
-        [
-            name,
-            mib(one["uss"]["start"]),
-            mib(one["uss"]["end"]),
-            growth(one, "uss"),
-            growth(one, "rss"),
-            steady(one, "descriptors"),
-            steady(one, "threads"),
-            share(one["processor_share"]),
-            str(one["starts"] - 1),
-        ]
+        {
+            "process": name,
+            "private_mib": [round(one["uss"][key] / MIB, 1) for key in ("start", "end")],
+            "slope_mib_per_h": None
+            if one["uss"]["slope_per_h"] is None
+            else round(one["uss"]["slope_per_h"]["per_h"] / MIB, 2),
+            "descriptors": [one["descriptors"][key] for key in ("settled", "end")],
+            "threads": [one["threads"][key] for key in ("settled", "end")],
+            "processor_share": one["processor_share"],
+            "restarts": one["starts"] - 1,
+        }
         for name, one in result["processes"].items()
     ]
+    hidden = ("begin_ns", "seconds", "messages", "stops", "faults")
     windows = [
-        [
-            f"{one['begin_s'] / 60.0:.0f}",
-            both(one["to_fingertip_ms"]),
-            both(one["to_arm_ms"]),
-            both(one["to_frame_ms"]),
-            share(one["valid_share"]),
-            share(one["follow_share"]),
-            ", ".join(f"{n} {mode}" for mode, n in one["stops_by_mode"].items()) or "0",
-            f"{one['megabytes']:.0f}",
-            share(one["graph_busy"]),
-            share(one["machine_busy"]),
-        ]
+        {"minute": round(one["begin_s"] / 60.0)} | {k: v for k, v in one.items() if k not in hidden}
         for one in result["windows"]
     ]
-    ports = [
-        [
-            one["node"],
-            one["topic"],
-            one["delivery"],
-            str(one["messages"]),
-            str(one["dropped"]),
-            str(one["gaps"]),
-            str(one["rejected"]),
-        ]
-        for one in result["ports"]
-        if one["dropped"] or one["gaps"] or one["rejected"]
-    ]
-    stops: Counter[str] = Counter()
-    for one in result["windows"]:
-        stops.update(one["stops"])
-    logs = result["logs_bytes_per_h"]
-    parts = [
-        f"{result['machine']}; {result['minutes']:.1f} minutes, "
-        f"{result['paths_followed']} strokes, pushes and other paths, "
-        f"beside {result['busy_processes']} busy processes",
-        table(
-            [
-                "process",
-                "own memory at first, MiB",
-                "at last",
-                "slope, MiB/h (95 %)",
-                "of what is resident",
-                "descriptors",
-                "threads",
-                "processor",
-                "restarts",
-            ],
-            processes,
-        ),
-        table(
-            [
-                "minute",
-                "to fingertip, ms p50 / p99",
-                "to arm",
-                "to frame",
-                "valid",
-                "both follow",
-                "ends of following, by mode",
-                "bag, MB",
-                "graph's share of the cores",
-                "all work",
-            ],
-            windows,
-        ),
-        table(["reader", "topic", "delivery", "taken", "superseded", "lost", "refused"], ports)
-        if ports
-        else "no message was superseded, lost or refused",
-        "\n".join(f"- {number} × {reason}" for reason, number in stops.most_common(10))
-        or "the arms never stopped following",
-        "" if logs is None else f"logs grow by {logs / 1024:.0f} KiB/h",
-        "lines of log: "
-        + (", ".join(f"{name} {n}" for name, n in result["log_lines"].items()) or "none"),
-        "findings: " + ("none" if not result["findings"] else ""),
-        "\n".join(f"- {one}" for one in result["findings"]),
-    ]
-    return "\n\n".join(part for part in parts if part)
+    ports = [one for one in result["ports"] if one["dropped"] or one["gaps"] or one["rejected"]]
+    for rows in (processes, windows, ports):
+        print_rows(rows, as_json=False)
+        print()
+    print("findings:", *(result["findings"] or ["none"]), sep="\n- ")
 
 
 def say(text: str) -> None:
@@ -703,7 +618,7 @@ def say(text: str) -> None:
 
 
 async def until_interrupted(soak: Soak) -> None:
-    """Run until the end; the first SIGINT or SIGTERM ends the run normally."""
+    """Run until the end. The first SIGINT or SIGTERM ends the run normally."""
     task = asyncio.create_task(soak.run())
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -735,8 +650,10 @@ def main() -> int:
     asyncio.run(until_interrupted(soak))
     result = make_report(soak)
     (folder / "soak.json").write_text(json.dumps(result, indent=1))
-    (folder / "soak.md").write_text(to_markdown(result) + "\n")
-    print(json.dumps(result) if given.json else to_markdown(result))
+    if given.json:
+        print(json.dumps(result))
+    else:
+        print_report(result)
     say(f"report and newest bag are in {folder}")
     return 1 if result["findings"] else 0
 

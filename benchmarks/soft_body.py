@@ -25,12 +25,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.experiments.compliance import POSITIONS_M
 from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_cylinder, require_material
+from flexsheet.nodes.arrays import Floats, Singles
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import body, precompute, snapshots
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery, locate
@@ -39,8 +39,6 @@ from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from flexsheet.nodes.fem_solver.table import TableSoftBody
-
-Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 DEMO_SPACING_M = 0.0045
@@ -59,12 +57,12 @@ HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
 STEP_M, STEPS = 2e-5, 300
 FROM_M = (0.004, 0.003)
 MIN_TOUCH_ANGLE_RAD = 0.7
-"""The touchable angle of the finest mesh in radians, for which its table fits into memory."""
+"""The touchable angle of the finest mesh in radians, which limits the size of the table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Slides:
-    """Results of a slide at one depth: values per step, and the maximum jump, m."""
+    """The results of a slide at one depth: values per step, and the maximum jump (m)."""
 
     force_n: Floats
     stiffness_n_per_m: Floats
@@ -133,7 +131,7 @@ def print_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> No
     """Print the relative error of the force of each method by depth, in percent.
 
     The reference is the stored force of an independent solver at three positions. At random points,
-    it is the force at the first position, or that of the last method.
+    the references are the force at the first position, and the force by the last method.
     """
     curves = [find_reference_curve(scene, *position) for position in POSITIONS_M]
     stored = np.array(
@@ -226,7 +224,7 @@ def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
     """Slide in each direction at one depth."""
     forces, stiffness, durations, jump = [], [], [], 0.0
     for heading in HEADINGS_RAD:
-        before: NDArray[np.float32] | None = None
+        before: Singles | None = None
         for along, around in places(float(heading)):
             angle = around / radius_m
             normal = np.array([0.0, np.sin(angle), np.cos(angle)])

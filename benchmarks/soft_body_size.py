@@ -24,14 +24,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.methods.charts import ROOT
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.messages.scene import Scene, require_cylinder, require_material
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, SkinResponse
@@ -41,14 +42,7 @@ from flexsheet.nodes.fem_solver.snapshots import DEPTHS_M
 from flexsheet.nodes.fem_solver.table import LINEAR_DEPTHS_M, Table, TableSoftBody, table_bytes
 from flexsheet.nodes.models.shapes import Shape, make_shape
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
-
 NAME, BY_SIZE, BY_CONTACT = "soft-body-size", "by_skin_nodes", "by_contact_nodes"
-HEAD = """\
-| method | skin nodes | contact nodes | reads | slow slide, µs | random, µs | floor, µs | table |
-|---|---|---|---|---|---|---|---|"""
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SPACINGS_M = (0.007, 0.006, 0.0045, 0.003, 0.0024, 0.0022, 0.0016, 0.00106)
 DEPTH_M = 0.005
@@ -109,7 +103,10 @@ def find_patch(mesh: SolidMesh, row_bytes: int) -> tuple[Ints, Ints]:
 def make_synthetic_body(
     scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int
 ) -> Synthetic:
-    """Make a synthetic body; rows_per_place: 1 for the linear table, more for the nonlinear one."""
+    """Make a synthetic body.
+
+    rows_per_place: 1 for the linear table, more for the nonlinear table.
+    """
     numbers, faces = find_patch(mesh, rows_per_place * 12 * len(mesh.skin))
     rest = mesh.nodes[mesh.skin]
     contact_nodes = np.searchsorted(mesh.skin, mesh.contact_nodes[numbers])
@@ -335,16 +332,14 @@ def measure_all() -> dict[str, Any]:
     scene = load_scene(SCENE_FILE)
     shape = make_shape(dict(require_cylinder(scene)))
     by_size, by_contact = [], []
-    print(HEAD)
     for spacing in SPACINGS_M:
         mesh = build_mesh(make_soft_body_spec(scene, spacing).mesh)
         for measure in (linear_point, table_point):
             by_size.append(measure(scene, mesh, shape, DEPTH_M))
-            say(by_size[-1])
         if spacing == CONTACT_SPACING_M:
             for depth in CONTACT_DEPTHS_M:
                 by_contact.append(linear_point(scene, mesh, shape, depth))
-                say(by_contact[-1])
+    print_rows([asdict(point) for point in (*by_size, *by_contact)], as_json=False)
     return {
         "machine": machine_name(),
         "code": json.loads(read_git_state(ROOT)),
@@ -352,17 +347,6 @@ def measure_all() -> dict[str, Any]:
         BY_SIZE: [asdict(point) for point in by_size],
         BY_CONTACT: [asdict(point) for point in by_contact],
     }
-
-
-def say(point: Point) -> None:
-    print(
-        f"| {point.method} | {point.skin_nodes} | {point.contact_nodes:g} |"
-        f" {point.read_bytes / 1e6:.2f} MB |"
-        f" {1e6 * point.slow_s:.0f} / {1e6 * point.slow_p99_s:.0f} |"
-        f" {1e6 * point.random_s:.0f} / {1e6 * point.random_p99_s:.0f} |"
-        f" {1e6 * point.floor_s:.0f} | {point.whole_table_bytes / 1e6:.0f} MB |",
-        flush=True,
-    )
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.base import Header, Message
@@ -18,6 +17,7 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import FingerPath, Fingertip, StereoPair
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_rpy
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
@@ -26,14 +26,12 @@ from flexsheet.nodes.twin.finger import FingerMotion
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 
-Floats = NDArray[np.float64]
 TruePathCase = Callable[[float], Floats]
 """The function that returns the true fingertip (3,) at a time, s."""
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 CALIBRATION_FILE = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
-MACHINE = "2-core Intel Xeon VM, no GPU"
 
 WRONG_FOOTED_M = 5e-3
 """The error of a valid fingertip above which it belongs to another object, in metres."""
@@ -43,9 +41,10 @@ WRONG_FOOTED_M = 5e-3
 class Frame:
     """A frame to simulate.
 
-    time_s: true middle of its exposure. stamp_s: stamp of the camera; None if correct. mark:
-        whether the finger has its marker. right_from_column: first column that the right camera
-        reads.
+    time_s: true middle of the exposure.
+    stamp_s: time stamp of the camera; None if the stamp is correct.
+    marker: whether the marker is visible.
+    right_from_column: first column that the right camera reads.
     """
 
     time_s: float
@@ -61,7 +60,10 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class ObservedFrame:
-    """The true fingertip (3,) of a frame, m, and the triangulator's message; None if late."""
+    """The true fingertip (3,), m, of a frame, and the triangulator's message.
+
+    The message is None if the frame is late.
+    """
 
     frame: Frame
     truth: Floats
@@ -112,7 +114,7 @@ class Observer:
         return self
 
     async def show(self, frame: Frame, motion: TruePathCase) -> ObservedFrame:
-        """Simulate a frame and pass it to the node; raises the error of a handler."""
+        """Simulate a frame, and pass the images to the node."""
         exposure_s = self.scene.camera.exposure_s
         left, right = frame.camera.picture(
             lambda offset_s: motion(frame.time_s + offset_s),
@@ -134,7 +136,10 @@ class Observer:
         )
 
     async def process_pair(self, pair: StereoPair, stamp_ns: int) -> Fingertip | None:
-        """Pass a pair to the node; return its message, None for a late pair."""
+        """Pass an image pair to the node, and return the message of the node, or None if late.
+
+        Raises RuntimeError if a handler of the node fails.
+        """
         self._said.clear()
         await self.node.step("stereo", pair, Header(1, stamp_ns, stamp_ns, "virtual", "camera", 1))
         if self.node.errors:
@@ -194,7 +199,7 @@ def path_motion(path: FingerPath, scene: Scene, *, seed: int) -> TruePathCase:
 def paths_motion(
     paths: Sequence[FingerPath], scene: Scene, *, seed: int
 ) -> tuple[TruePathCase, float]:
-    """Make a finger that follows several paths; return it and the total duration."""
+    """Return the motion of a finger along several paths, and the total duration (s)."""
     motion = FingerMotion.resting(paths[0].positions_world_m[0], seed=seed)
     starts_s, motions = [0.0], [motion]
     for path in paths:

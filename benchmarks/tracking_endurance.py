@@ -1,6 +1,6 @@
 """Test whether the fingertip jumps or follows another object, over 100,000 adverse frames.
 
-OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_endurance [--frames 100000] [--json]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_endurance [--frames 100000]
 
 A finger makes slow and fast gestures in front of the sheet. After half a second it is surrounded by
 clutter, which changes every 2000 frames: beads like the marker that swing or rest, reflections of
@@ -26,14 +26,12 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.tracking_bench import (
-    MACHINE,
     WRONG_FOOTED_M,
     Frame,
     ObservedFrame,
@@ -43,8 +41,10 @@ from benchmarks.tracking_bench import (
     paths_motion,
     twin_camera,
 )
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.twin.clutter import (
     CLAMPS,
@@ -65,8 +65,6 @@ from flexsheet.nodes.twin.clutter import (
 from flexsheet.nodes.twin.gestures import GESTURES
 from flexsheet.nodes.twin.pixels import CameraView, TwinCamera
 
-Floats = NDArray[np.float64]
-
 SEQUENCE_FRAMES = 2000
 MIDDLE_M, SPREAD_M = (0.0, 0.01, 0.02), (0.05, 0.04, 0.03)
 """The mean and the standard deviation (3,) of the centres of the clutter, in metres."""
@@ -79,8 +77,7 @@ SIGMAS = (3, 4, 5, 6)
 BEYOND_MM = (0.3, 1.0, 5.0)
 SHOWN = 30
 CLEAR_PX = 3.0
-"""The minimum image distance between the marker and objects that do not hide it, px.
-"""
+"""The minimum image distance (px) from the marker to objects in front of the finger."""
 
 
 def make_clutter(random: np.random.Generator) -> Clutter:
@@ -143,7 +140,10 @@ def gestures(scene: Scene, random: np.random.Generator) -> Iterator[FingerPath]:
 def exposures(
     scene: Scene, alone: TwinCamera, crowded: TwinCamera, count: int, random: np.random.Generator
 ) -> Iterator[Frame]:
-    """Make a number of frames at the camera's rate; some are lost, in some the marker is hidden."""
+    """Make frames at the rate of the camera.
+
+    Some frames are lost, and in some frames the marker is hidden.
+    """
     period_s = 1.0 / scene.camera.rate_hz
     hidden_until = -1
     tick = taken = 0
@@ -205,19 +205,8 @@ class Tally:
     refused_in_full_view: int = 0
 
     def add(self, other: Tally) -> None:
-        self.frames += other.frames
-        self.valid += other.valid
-        self.steps += other.steps
-        self.reasons += other.reasons
-        self.jump_sigmas += other.jump_sigmas
-        self.jump_sigmas_along += other.jump_sigmas_along
-        self.jumps_mm += other.jumps_mm
-        self.errors_mm += other.errors_mm
-        self.jumps += other.jumps
-        self.wrong_footed += other.wrong_footed
-        self.outages += other.outages
-        self.reacquired_ms += other.reacquired_ms
-        self.refused_in_full_view += other.refused_in_full_view
+        for one in fields(self):
+            setattr(self, one.name, getattr(self, one.name) + getattr(other, one.name))
 
     def report(self) -> dict[str, Any]:
         jump_sigmas, jumps_mm = np.array(self.jump_sigmas), np.array(self.jumps_mm)
@@ -310,8 +299,8 @@ def evaluate_sequence(seen: list[ObservedFrame], scene: Scene, seed: int) -> Tal
 def _jump(before: ObservedFrame, after: ObservedFrame) -> tuple[float, float, float]:
     """Return the error (m) of the fingertip's motion between two frames, and standard deviations.
 
-    The first is that of the whole difference (root of the trace of the sum of both covariances),
-    the second that along the motion.
+    The first standard deviation is the root of the trace of the sum of both covariances. The second
+    one is along the motion.
     """
     assert before.fingertip is not None
     assert after.fingertip is not None
@@ -344,12 +333,12 @@ def run(seed: int, count: int) -> Tally:
     return evaluate_sequence(seen, bench_scene(), seed)
 
 
-def endure(frames: int, *, processes: int, first_seed: int = 1) -> Tally:
+def endure(frames: int, *, processes: int) -> Tally:
     """Simulate sequences of SEQUENCE_FRAMES in a pool of processes."""
     counts = [SEQUENCE_FRAMES] * (frames // SEQUENCE_FRAMES)
     if frames % SEQUENCE_FRAMES:
         counts.append(frames % SEQUENCE_FRAMES)
-    seeds = range(first_seed, first_seed + len(counts))
+    seeds = range(1, 1 + len(counts))
     total, began_s = Tally(), time.monotonic()
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=context) as pool:
@@ -370,16 +359,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--first-seed", type=int, default=1)
-    parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    report = endure(given.frames, processes=given.processes, first_seed=given.first_seed).report()
-    if given.json:
-        print(json.dumps(report))
-        return
-    print(f"{MACHINE}")
-    for key, value in report.items():
-        print(f"{key}: {json.dumps(value)}")
+    report = endure(given.frames, processes=given.processes).report()
+    print(json.dumps({"machine": machine_name(), **report}, indent=1))
 
 
 if __name__ == "__main__":

@@ -6,8 +6,7 @@ The simulated finger is tracked for half a second, then disturbed for some time 
 then undisturbed. For the disturbed frames the tables contain the fraction of valid ones and the
 reasons of the others. For valid ones they contain the errors in mm and in standard deviations (of
 track and calibration together). The recovery time is that from the first undisturbed image to the
-next valid fingertip. Draws `docs/charts/limits-*.svg` and prints tables. Takes some ten minutes;
-with --quick there is one repetition of six, and no charts.
+next valid fingertip. Takes some ten minutes; with --quick there is one repetition of six.
 """
 
 from __future__ import annotations
@@ -21,15 +20,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.tracking_bench import (
     CALIBRATION_FILE,
-    MACHINE,
-    ROOT,
     WRONG_FOOTED_M,
     Frame,
     ObservedFrame,
@@ -41,7 +36,10 @@ from benchmarks.tracking_bench import (
     sigmas,
     twin_camera,
 )
+from flexsheet.launch.commands.output import print_rows
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.clutter import (
     CLUTTER,
     MARKER_RADIUS_M,
@@ -56,8 +54,6 @@ from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.gestures import circle, hover, reach
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 
-Floats = NDArray[np.float64]
-
 BEFORE_S, DURING_S, AFTER_S = 0.5, 0.8, 0.8
 MOVE_S = 0.4
 REPETITIONS = 6
@@ -68,13 +64,14 @@ SETTLED_S = 0.1
 AFTERMATH_S = 0.3
 """The time after a gap or a clock step that counts as disturbed, in seconds."""
 
-CHARTS = ROOT / "docs" / "charts"
 MAX_DEFOCUS_APERTURE_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Frames in order of their true times; frames in [begins_s, ends_s) are disturbed.
+    """The frames of a scenario in the order of true time.
+
+    Frames from begins_s to ends_s are disturbed.
 
     calibration: None if the scene's optics are exact.
     """
@@ -95,7 +92,7 @@ Setting = Callable[[Scene, float, int], Scenario]
 class Failure:
     """A kind of disturbance.
 
-    severities: from mild to severe; some have two directions.
+    severities: values from mild to severe. Some kinds have two directions.
     """
 
     title: str
@@ -106,7 +103,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Results at one severity; errors are of valid fingertips, None if there are none.
+    """The results at one severity. Errors refer to valid fingertips, and are None without any.
 
     wrong: number of valid fingertips more than 5 mm from the finger.
     recovery_ms: time from the first undisturbed image to the next valid fingertip, median and
@@ -137,7 +134,7 @@ def clean() -> TwinCamera:
 def times(
     scene: Scene, until_s: float, *, since_s: float = 0.0, rate_hz: float = 0.0
 ) -> list[float]:
-    """Return the middles of exposures, s.
+    """Return the times (s) of the middles of exposures.
 
     rate_hz: rate of the images; 0: rate of the camera.
     """
@@ -281,7 +278,7 @@ def slowed(scene: Scene, rate_hz: float, repetition: int) -> Scenario:
 
 
 def interrupted(scene: Scene, gap_ms: float, repetition: int) -> Scenario:
-    """Interrupt the images; the frames after the gap are evaluated."""
+    """Interrupt the images. The frames after the gap are evaluated."""
     again_s = BEFORE_S + 1e-3 * gap_ms
     moments = times(scene, BEFORE_S) + times(scene, again_s + AFTER_S, since_s=again_s)
     frames = [Frame(t, clean()) for t in moments]
@@ -401,7 +398,7 @@ def measure(name: str, severity: float, *, repetitions: int = REPETITIONS) -> Ro
 
 
 def recovery_ms(after: Sequence[ObservedFrame]) -> float:
-    """Return the time to the first valid fingertip, ms; infinite if there is none."""
+    """Return the time to the first valid fingertip in ms, or infinity without any."""
     back_s = next((one.frame.time_s for one in after if one.valid), np.inf)
     return 1e3 * (back_s - after[0].frame.time_s)
 
@@ -428,99 +425,6 @@ def evaluate(
     )
 
 
-def tables(results: dict[str, list[Row]]) -> str:
-    """Format the tables as Markdown."""
-    lines = []
-    for name, rows in results.items():
-        failure = FAILURES[name]
-        lines += [
-            f"### {failure.title}",
-            "",
-            f"| {failure.severity} | valid | else | error, rms / most | most, in stated σ "
-            "| back after, median / most |",
-            "|---|---|---|---|---|---|",
-        ]
-        for row in rows:
-            reasons = ", ".join(f"`{reason}`" for reason in list(row.reasons)[:3]) or "–"
-            error, sigma, back = "–", "–", "–"
-            if row.rms_mm is not None and row.max_mm is not None:
-                error = f"{row.rms_mm:.2f} / {row.max_mm:.2f} mm"
-                sigma = f"{row.worst_sigmas:.1f}"
-            if row.recovery_ms is not None:
-                times = (f"{ms:.0f}" if np.isfinite(ms) else "never" for ms in row.recovery_ms)
-                back = " / ".join(times) + " ms"
-            lines.append(
-                f"| {row.severity:g} | {100 * row.valid_share:.0f} % | {reasons} | {error} "
-                f"| {sigma} | {back} |"
-            )
-        lines.append("")
-    return "\n".join(lines)
-
-
-def draw(name: str, rows: Sequence[Row]) -> Path:
-    """Draw a chart, for light and dark themes: errors and fraction of valid fingertips."""
-    import matplotlib as mpl
-
-    mpl.use("svg")
-    from matplotlib import pyplot
-
-    grey = "#808890"
-    style: dict[Any, Any] = {
-        "svg.hashsalt": "limits",
-        "font.size": 9,
-        "text.color": grey,
-        "axes.labelcolor": grey,
-        "axes.edgecolor": grey,
-        "xtick.color": grey,
-        "ytick.color": grey,
-    }
-    with mpl.rc_context(style):
-        figure, (above, below) = pyplot.subplots(
-            2, 1, sharex=True, figsize=(6.4, 4.4), height_ratios=(3, 2), layout="constrained"
-        )
-        figure.patch.set_alpha(0.0)
-        places = np.arange(len(rows))
-        for axes in (above, below):
-            axes.patch.set_alpha(0.0)
-            for side in ("top", "right"):
-                axes.spines[side].set_visible(False)
-        for key, colour, marker, label in (
-            ("max_mm", "#d97706", "v", "most"),
-            ("p99_mm", "#0891b2", "s", "99 %"),
-            ("rms_mm", "#4f7df0", "o", "rms"),
-        ):
-            values = [getattr(row, key) for row in rows]
-            heights = [np.nan if value is None else value for value in values]
-            above.plot(places, heights, marker, color=colour, label=label, linestyle="-")
-        above.axhline(0.3, color=grey, linestyle=":", linewidth=1)
-        above.set_yscale("log")
-        above.set_ylim(0.01, 10.0)
-        above.set_ylabel("error of valid fingertips, mm")
-        above.set_title(FAILURES[name].title, fontsize=10, loc="left")
-        above.legend(frameon=False, ncols=3, loc="upper right", labelcolor=grey)
-        bottom = np.zeros(len(rows))
-        totals = sum((Counter(row.reasons) for row in rows), Counter())
-        shares = [("valid", [row.valid_share for row in rows])]
-        for reason, _ in totals.most_common():
-            shares.append((reason, [row.reasons.get(reason, 0) / row.frames for row in rows]))
-        colours = ("#4f7df0", "#d97706", "#b45309", "#a855f7", "#be185d", "#65a30d", "#0891b2")
-        for place, (label, share) in enumerate(shares):
-            colour = colours[min(place, len(colours) - 1)]
-            below.bar(places, share, 0.7, bottom=bottom, color=colour, label=label)
-            bottom += np.array(share)
-        below.set_ylim(0.0, 1.0)
-        below.set_ylabel("share of frames")
-        below.set_xticks(places, [f"{row.severity:g}" for row in rows])
-        below.set_xlabel(FAILURES[name].severity)
-        below.legend(
-            frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), labelcolor=grey, fontsize=8
-        )
-        path = CHARTS / f"limits-{name}.svg"
-        figure.savefig(path, metadata={"Date": None})
-        pyplot.close(figure)
-    return path
-
-
 def sweep(names: Iterable[str], repetitions: int) -> dict[str, list[Row]]:
     results: dict[str, list[Row]] = {}
     for name in names:
@@ -543,20 +447,19 @@ def main() -> None:
         if name not in FAILURES:
             parser.error(f'no failure "{name}"; there are: {", ".join(FAILURES)}')
     results = sweep(given.names, 1 if given.quick else REPETITIONS)
-    if not given.quick:
-        for name, rows in results.items():
-            draw(name, rows)
+    printed = {name: [asdict(row) for row in rows] for name, rows in results.items()}
     if given.json:
-        printed: dict[str, Any] = {
-            name: [asdict(row) for row in rows] for name, rows in results.items()
-        }
         slowest = {
             name: max((row.recovery_ms[1] for row in rows if row.recovery_ms), default=None)
             for name, rows in results.items()
         }
-        print(json.dumps({"machine": MACHINE, "max_recovery_ms": slowest, "failures": printed}))
+        print(
+            json.dumps({"machine": machine_name(), "max_recovery_ms": slowest, "failures": printed})
+        )
     else:
-        print(tables(results))
+        for name, each in printed.items():
+            print(f"\n{FAILURES[name].title}; severity: {FAILURES[name].severity}")
+            print_rows(each, as_json=False)
 
 
 if __name__ == "__main__":

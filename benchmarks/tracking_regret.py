@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
@@ -38,6 +37,7 @@ from benchmarks.hand_motion import (
 from benchmarks.tracking_bench import ROOT, bench_scene
 from flexsheet.launch.methods.charts import git_commit
 from flexsheet.launch.methods.results import describe_load, machine_name
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.adaptive import (
     TRACKING_METHODS,
     AdaptiveBank,
@@ -46,8 +46,6 @@ from flexsheet.nodes.triangulator.adaptive import (
 )
 from flexsheet.nodes.triangulator.filters import Estimate
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
-
-Floats = NDArray[np.float64]
 
 FILE_NAME = "tracking-regret.json"
 RECORDING = ROOT.parent / "shared" / "data" / "finger" / "reach_and_grip.csv"
@@ -65,7 +63,7 @@ MAX_TAPS_S, MAX_TAPS = 1.6, 90
 
 @dataclass(frozen=True, slots=True)
 class Hand:
-    """A hand: its name, true path (n, 3), mm, at GRID_HZ, and autocovariance by axis (lags, 3).
+    """A hand: name, true path (n, 3), mm, at GRID_HZ, and autocovariance by axis (lags, 3).
 
     A recorded hand has no autocovariance.
     """
@@ -79,10 +77,11 @@ class Hand:
 
 @dataclass(frozen=True, slots=True)
 class Regret:
-    """One case: its conditions, and the RMS error of each method and reference, mm.
+    """The conditions of one case, and the RMS error (mm) of each method and reference.
 
-    error_mm: by method.  bank_mm: of the bank's best single model, chosen in hindsight.
-    wiener_mm: of the predictor that knows the spectrum; None for a recorded hand.
+    error_mm: error by method.
+    bank_mm: error of the best single model of the bank, chosen in hindsight.
+    wiener_mm: error of the predictor that knows the spectrum, or None for a recorded hand.
     """
 
     motion: str
@@ -143,7 +142,10 @@ def autocovariance(path: Floats, max_lag_s: float) -> Floats:
 
 
 def read_recording(file: Path) -> Hand:
-    """Read a recorded finger; raises ValueError for a file without its columns."""
+    """Read a recorded finger.
+
+    Raises ValueError if the file lacks a column.
+    """
     table = np.genfromtxt(file, delimiter=",", names=True)
     names = ("t_s", "x_mm", "y_mm", "z_mm")
     if table.dtype.names is None or not set(names) <= set(table.dtype.names):

@@ -28,7 +28,10 @@ CODE_SPAN = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 
 @dataclass(frozen=True)
 class Block:
-    """Fenced block; `not_run` is the page's reason for not running it, or empty."""
+    """A fenced block of code on a page.
+
+    not_run: reason for not running the block, or None.
+    """
 
     page: Path
     line: int
@@ -71,7 +74,7 @@ def site_docs() -> Path:
 
 
 def as_built(page: Path) -> Path:
-    """Return the page in `site_docs` for a page of docs/; other files as they are."""
+    """Return the built version of a page of docs/. Other pages are returned unchanged."""
     return site_docs() / page.relative_to(DOCS) if page.is_relative_to(DOCS) else page
 
 
@@ -103,8 +106,7 @@ def nav_pages() -> list[str]:
 
 
 def blocks(page: Path) -> list[Block]:
-    """Yield the fenced blocks, also those in lists, with the reason of a preceding comment not to
-    run one."""
+    """Return the fenced blocks of a page, with the reasons for not running them."""
     found: list[Block] = []
     indent, language, begun, inside = "", "", 0, None
     comment: str | None = None
@@ -128,7 +130,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def prose(page: Path) -> list[tuple[int, str]]:
-    """Yield the lines outside of blocks, with their numbers."""
+    """Return the lines outside of blocks, with line numbers."""
     lines, inside = [], False
     for number, line in enumerate(page.read_text().splitlines(), start=1):
         if FENCE.match(line):
@@ -145,7 +147,7 @@ def count_words(page: Path) -> int:
 
 
 def links(page: Path) -> list[Link]:
-    """Yield the links and images outside of code."""
+    """Return the links and images outside of code."""
     return [
         Link(page, number, match[2], is_picture=bool(match[1]))
         for number, line in prose(page)
@@ -154,7 +156,7 @@ def links(page: Path) -> list[Link]:
 
 
 def code_spans(page: Path) -> list[tuple[int, str]]:
-    """Yield the code spans within lines of text."""
+    """Return the code spans within lines of text, with line numbers."""
     return [(number, span) for number, line in prose(page) for span in CODE_SPAN.findall(line)]
 
 
@@ -163,9 +165,9 @@ def headings(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of headings that both repository hosts and the site's generator make.
+    """Return the anchors that repository hosts and the generator of the site give to headings.
 
-    Only the first of several headings with one name counts, since the others' anchors differ.
+    Headings with different anchors are omitted.
     """
     found = set()
     for heading in headings(page):

@@ -70,7 +70,7 @@ def target(pose: Floats, phase: Any = "contact", valid_at_ns: int = 0) -> SheetT
 
 
 def sheet_at(angle_rad: float) -> Floats:
-    """Return the tangent plane of the cylinder at an angle, displaced by an error."""
+    """Return the pose of a tangent sheet at an angle around the cylinder, with an error."""
     solid = SCENE.object
     pose = solid.world_from_object
     turn = rotation_from_vector(np.array([-angle_rad - TURNED_RAD, 0.0, 0.0]))
@@ -108,7 +108,7 @@ class MessageWriter:
     def write(
         self, topic: str, message: Message, seconds: float, *, age_s: float = 0.0, writer: str = "n"
     ) -> None:
-        """Write a message at the time `seconds`, with a source timestamp `age_s` earlier."""
+        """Write a message at a time (s), with a source timestamp that is `age_s` earlier."""
         self.skip(topic)
         if topic in self._leave_out:
             return
@@ -119,9 +119,7 @@ class MessageWriter:
 
 
 def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
-    """Write three seconds: a stroke of one second, then a fault, an e-stop, a bookmark and a
-    gap.
-    """
+    """Write a bag of three seconds: a stroke of one second, then faults and a bookmark."""
     begin_s, finish_s = stroke_window_s(STROKE_S)
     recording = {"clock_id": "clock", "started": "2026-11-22T10:00:00+00:00",
                  "started_ns": str(START_NS)}  # fmt: skip

@@ -30,7 +30,7 @@ from website.pages import CHARTS, drawings
 from website.scene_page import missing_effects
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
-"""Topics that the drawings of the graph omit, as their page explains."""
+"""The topics that the drawings of the graph omit."""
 
 START = DOCS / "index.md"
 

@@ -24,7 +24,7 @@ from pathlib import Path
 import flexsheet
 
 async def main():
-    graph = flexsheet.RunningGraph(flexsheet.load_graph(Path("guard.yaml")))
+    graph = flexsheet.RunningGraph(flexsheet.load_graph(Path("runs/guard.yaml")))
     async with graph:
         await graph.wait_ready()
         note, checks = "", ()
@@ -45,7 +45,7 @@ GUARD_DEMO_SCRIPT = """
 from pathlib import Path
 import flexsheet
 
-graph = flexsheet.load_graph(Path("guard-demo.yaml"))
+graph = flexsheet.load_graph(Path("runs/guard-demo.yaml"))
 guard = graph.nodes["guard"]
 print(*(port.topic for port in (*guard.inputs, *guard.outputs)), len(graph.nodes) > 5)
 """
@@ -62,11 +62,12 @@ def python_block(page: str, mark: str) -> str:
 
 
 def run_script(script: str, cwd: Path, *arguments: str) -> str:
+    path = f"{cwd / 'runs'}{os.pathsep}{ROOT}"
     with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as runs:
         done = subprocess.run(
             [sys.executable, "-c", script, *arguments],
             cwd=cwd,
-            env={**os.environ, "FLEXSHEET_RUNS": runs, "PYTHONPATH": f"{cwd}{os.pathsep}{ROOT}"},
+            env={**os.environ, "FLEXSHEET_RUNS": runs, "PYTHONPATH": path},
             capture_output=True, text=True, timeout=DEADLINE_S, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -105,7 +106,7 @@ def test_the_plot_script_reads_a_bag(tmp_path: Path) -> None:
     write_stroke(tmp_path / "stroke.mcap", count=20)
     run_script(python_block("other-tools.md", "BagReader"), tmp_path, "stroke.mcap")
     assert (tmp_path / "stroke.png").stat().st_size > 0
-    rows = np.loadtxt(tmp_path / "fingertip.csv", delimiter=",", skiprows=1)
+    rows = np.loadtxt(tmp_path / "stroke.csv", delimiter=",", skiprows=1)
     assert rows.shape == (20, 4)
     np.testing.assert_allclose(rows[:, 1], np.arange(20) * 1e-3, atol=1e-9)
 
@@ -127,9 +128,11 @@ def test_the_launch_files_of_the_node_tutorial_run(tmp_path: Path) -> None:
         for block in blocks(DOCS / "write-your-own-node.md")
         if block.language == "yaml" and "guard:" in block.text
     )
-    (tmp_path / "guard.yaml").write_text(launch_file)
-    (tmp_path / "guard-demo.yaml").write_text(for_demo)
-    (tmp_path / "speed_guard.py").write_text(
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    (runs / "guard.yaml").write_text(launch_file)
+    (runs / "guard-demo.yaml").write_text(for_demo)
+    (runs / "speed_guard.py").write_text(
         python_block("write-your-own-node.md", "class SpeedGuard(")
     )
     (tmp_path / "launch").symlink_to(ROOT / "launch")

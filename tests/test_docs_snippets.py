@@ -1,9 +1,8 @@
 """Test that the code of the documentation runs.
 
-Python blocks run page by page, each page in one namespace. YAML blocks are validated by their form:
-a launch file, nodes of one, a node's parameters, parts of a scene. In shell blocks, and in code
-within the text, each call of `flexsheet` is parsed; fast ones run. `<!-- not run: why -->` before a
-block limits the test to parsing.
+The Python blocks of a page run in one namespace. YAML blocks are validated as launch files, nodes,
+parameters or parts of a scene. Each call of `flexsheet` in shell blocks and in the text is parsed,
+and fast calls run. A block after the comment `<!-- not run: why -->` is only parsed.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import find_parameters_type
-from tests.doc_pages import ROOT, Block, as_built, blocks, code_spans, name, pages, site_pages
+from tests.doc_pages import DOCS, ROOT, Block, as_built, blocks, code_spans, name, pages, site_pages
 from tests.scenes import load_values
 from tests.test_cli_help import parse
 
@@ -39,6 +38,9 @@ LANGUAGES = {"python", "yaml", "bash", "sh", "console", "text"}
 SHELLS = ("bash", "sh", "console")
 BLOCKS = {page: blocks(page) for page in pages()}
 SCENE = ROOT / "launch" / "scenes" / "cylinder.yaml"
+
+TUTORIALS = ("tutorial.md", "tutorial-record.md", "write-your-own-node.md")
+"""The pages whose files the reader saves in the folder `runs` of the clone."""
 
 OURS = {"flexsheet", "make", "python", "pytest"}
 OTHERS = {
@@ -52,7 +54,7 @@ AT_ONCE = ("--help", "--version", "--install-completion", "--show-completion")
 """Options that act during parsing, also in the reader's home."""
 
 LACKS_SOMETHING = ("MissingParameter", "NoArgsIsHelpError")
-"""Errors of the command line for a command name without its arguments."""
+"""The errors of the command line for a command without arguments."""
 
 CHEAP = (
     "flexsheet node ",
@@ -61,8 +63,10 @@ CHEAP = (
     "flexsheet calibrate board",
     "flexsheet keys new",
 )
-"""Commands to run, in a separate folder. Examples of the generated pages (`sh`) are excluded,
-because they use files that do not exist."""
+"""The beginnings of commands to run in a separate folder.
+
+Examples of generated pages (`sh`) do not run, because the files in the examples do not exist.
+"""
 
 
 def with_language(*languages: str) -> dict[Path, list[Block]]:
@@ -73,6 +77,7 @@ def with_language(*languages: str) -> dict[Path, list[Block]]:
 @pytest.fixture
 def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Create a working folder with the project's launch files and without the user's files."""
+    (tmp_path / "runs").mkdir()
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     for linked in ("scenes", "calibrations"):
         (tmp_path / linked).symlink_to(ROOT / "launch" / linked)
@@ -119,11 +124,12 @@ def test_yaml_blocks_are_valid(block: Block, clone: Path, monkeypatch: pytest.Mo
     values = YAML(typ="safe").load(block.text)
     if block.not_run is None:
         write_modules(block.page, clone, monkeypatch)
-        check_yaml(block.text, values, clone, block.place)
+        folder = clone / "runs" if block.page.name in TUTORIALS else clone
+        check_yaml(block.text, values, folder, block.place)
 
 
 def write_modules(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write the page's first Python block to a file if it names one in its first line."""
+    """Write the first Python block of a page to the module files that the page names."""
     first = next(iter(with_language("python").get(page, [])), None)
     if first is not None and first.text.startswith('"""'):
         for named in re.findall(r"(\w+):\w+", page.read_text()):
@@ -164,7 +170,7 @@ def check_nodes(nodes: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """Yield the calls of a block as words, without comments, sudo and variables."""
+    """Yield the words of each call in a block, without comments, sudo and variables."""
     for line in text.replace("\\\n", " ").splitlines():
         line = re.sub(r"^\w+\$ ", "", line)  # noqa: PLW2901  # a prompt of a console
         call: list[str] = []
@@ -187,9 +193,10 @@ def program(call: Sequence[str]) -> list[str]:
 def check_call(
     call: Sequence[str], written: set[str], place: str, *, may_name_only: bool = False
 ) -> None:
-    """Return whether a call can be parsed, or is the name of a command.
+    """Check that a call can be parsed.
 
     written: files that calls of the page have written.
+    may_name_only: whether the call may be the name of a command without arguments.
     """
     match program(call):
         case ["flexsheet" | "/opt/flexsheet/.venv/bin/flexsheet", *rest]:
@@ -222,6 +229,15 @@ def test_each_call_in_a_block_can_be_made(page: Path) -> None:
     for block in with_language(*SHELLS)[page]:
         for call in commands(block.text):
             check_call(call, written, block.place)
+
+
+@pytest.mark.parametrize("page", TUTORIALS)
+def test_tutorials_write_only_into_the_folder_that_git_ignores(page: str) -> None:
+    assert "runs/" in (ROOT / ".gitignore").read_text().splitlines()
+    calls = [" ".join(call) for block in blocks(DOCS / page) for call in calls_of(block)]
+    texts = [*calls, *(span for _, span in code_spans(DOCS / page))]
+    for file in re.findall(r"[\w./-]+\.(?:csv|html|mcap|png|py|svg|yaml)\b", " ".join(texts)):
+        assert file.startswith("runs/") or (ROOT / file).is_file(), f"{page}: save runs/{file}"
 
 
 @pytest.mark.parametrize("page", pages(), ids=name)

@@ -7,22 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.soft_body_limits import (
-    CYLINDER,
-    Body,
-    count_inverted,
-    cylinder,
-    deepest_mm,
-    make_body,
-    make_sample,
-    make_scene,
-    newton,
-)
 from flexsheet.messages.scene import BaseSupport, Sphere
 from flexsheet.nodes.fem_solver.body import state_force_error_ratio
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
 from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec
 from flexsheet.nodes.models import rigid
+from tests.limit_bodies import (
+    CYLINDER,
+    Body,
+    count_inverted,
+    cylinder,
+    make_body,
+    make_sample,
+    make_scene,
+    solve_deepest_mm,
+)
 from tests.soft_bodies import cylinder_spec
 
 ENDS = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
@@ -53,7 +52,7 @@ def test_two_supports_hold_and_one_point_is_rejected(body: Body) -> None:
     ]
     forces = [float(answer.force_n @ sample.normal) for answer in answers]
     assert 0.3 * forces[1] < forces[0] < forces[1]
-    assert deepest_mm(newton(hanging, sample, (0.002, 0.004))) == 4.0
+    assert solve_deepest_mm(hanging, sample, (0.002, 0.004)) == 4.0
     point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
     with pytest.raises(ValueError, match=r"object.support: .* at least three"):
         make_body(make_scene(CYLINDER, point, height_m=0.02))

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from benchmarks.meshing import min_dihedral_rad
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.messages.scene import Mesh, Scene
 from flexsheet.nodes.fem_solver.elasticity import (
@@ -200,6 +199,21 @@ def require_sound(solid: SolidMesh) -> None:
     assert (np.unique(solid.contact_faces) == np.arange(len(solid.contact_nodes))).all()
     assert np.abs(np.linalg.norm(solid.contact_normals, axis=1) - 1).max() < 1e-9
     require_fixation("", solid.nodes, solid.fixed)
+
+
+def min_dihedral_rad(points: Floats, tetrahedra: Ints) -> Floats:
+    """Return the smallest angle between two faces of each straight tetrahedron (e,)."""
+    corners = points[tetrahedra[:, :4]]
+    normals = []
+    for i in range(4):
+        a, b, c = (corners[:, j] for j in range(4) if j != i)
+        normal = np.cross(b - a, c - a)
+        inwards = ((corners[:, i] - a) * normal).sum(axis=1, keepdims=True) > 0.0
+        normal = np.where(inwards, -normal, normal)
+        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    cosines = [-(a * b).sum(axis=1) for a, b in itertools.combinations(normals, 2)]
+    smallest: Floats = np.arccos(np.clip(np.max(cosines, axis=0), -1.0, 1.0))
+    return smallest
 
 
 @pytest.mark.parametrize("name", SHAPES)

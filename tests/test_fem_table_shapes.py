@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.soft_body_limits import Body, count_inverted, make_body, make_scene
 from flexsheet.nodes.fem_solver import snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody, attach_table, make_table_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import Response
 from flexsheet.nodes.fem_solver.precompute_table import compute_table
 from flexsheet.nodes.fem_solver.table import END_SPAN_M
+from tests.limit_bodies import Body, count_inverted, make_body, make_scene
 from tests.soft_bodies import InlineExecutor
 
 DEPTHS = (0.0015, 0.002, 0.003, 0.004)

@@ -11,7 +11,10 @@ from pathlib import Path
 import pytest
 
 from benchmarks.record import record
+from flexsheet.launch.experiments.offline import Metric, metric_tolerances
+from flexsheet.nodes.twin.tolerance_table import Profile
 from tests.doc_pages import DOCS, ROOT, name, pages
+from tests.scenes import load_cylinder
 from website.figures import FIGURE, RESULTS, FigureError, strip, update
 
 NUMBER = re.compile(r"(?<![\w.])\d+\.\d+")
@@ -56,6 +59,34 @@ def test_a_result_that_was_not_recorded_is_named(tmp_path: Path) -> None:
 def test_figures_of_pages_are_those_of_the_results(page: Path) -> None:
     text = page.read_text()
     assert update(text) == text, "run: make pages"
+
+
+def test_tolerances_of_laboratories_are_those_of_the_scene_and_of_the_report() -> None:
+    limits = metric_tolerances(load_cylinder())
+    head, _, *rows = (
+        [cell.strip() for cell in line.split("|")]
+        for line in (DOCS / "robustness.md").read_text().splitlines()
+        if line.startswith("|")
+    )
+    column, metrics = head.index("tolerance"), set()
+    for row in rows:
+        figure = FIGURE.match(row[column])
+        assert figure is not None, row[column]
+        *_, metric, key = figure["path"].split(".")
+        assert key == "tolerance"
+        assert float(figure["shown"]) == limits[Metric(metric)]
+        metrics.add(Metric(metric))
+    assert metrics == set(limits)
+
+
+def test_commissioning_states_how_often_predicted_limits_are_met() -> None:
+    stated = {
+        (figure["file"], figure["path"])
+        for figure in FIGURE.finditer((DOCS / "commission.md").read_text())
+    }
+    path = "commissioning.predictions.sheet_mm.covered"
+    for profile in Profile:
+        assert (f"robustness-commissioned-{profile}", path) in stated
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", DOCS / "results.md"], ids=name)

@@ -41,13 +41,13 @@ from flexsheet.nodes.twin.arms import (
 from tests.examples import examples
 from tests.network import TcpRelay
 from tests.waiting import DEADLINE_S
-from website import registers_page
+from website import arms_page
 
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
 def test_the_register_map_has_the_addresses_of_the_fields() -> None:
-    assert "| 8–19 | `joints_rad` | float32 × 6 |" in registers_page.render()
+    assert "| 8–19 | `joints_rad` | float32 × 6 |" in arms_page.render_registers()
 
 
 def status_registers(**changed: int | float) -> list[int]:

@@ -65,7 +65,7 @@ from tests.rv_1a import (
     forward,
 )
 from tests.waiting import DEADLINE_S
-from website.registers_page import render_packet
+from website.arms_page import render_packet
 
 Floats = NDArray[np.float64]
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])

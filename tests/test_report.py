@@ -22,7 +22,7 @@ from flexsheet.launch.bags.report.charts import find_intervals, mark_isolated
 from flexsheet.launch.bags.report.findings import find_problems
 from flexsheet.launch.bags.report.numbers import compute_numbers, describe_methods
 from flexsheet.launch.bags.report.page import COLOURS, MARK, SECTIONS, render_page
-from flexsheet.launch.bags.report.series import Events, Grid, Range, RunningMoments, Spread, States
+from flexsheet.launch.bags.report.series import Events, Grid, Maxima, RunningMoments, Spread, States
 from flexsheet.launch.bags.report.session import PortTotals, read_session
 from flexsheet.launch.bags.report.strokes import SheetErrors
 from flexsheet.launch.bags.report.write import make_result, report
@@ -82,7 +82,7 @@ def test_a_histogram_has_quantiles_to_a_cell(durations: list[float], fraction: f
 def test_nothing_has_no_quantile_and_no_summary() -> None:
     grid = Grid(0, 1.0, 3)
     assert Spread(grid).quantile_s(0.5) is None
-    assert Range(grid).overall() is None
+    assert Maxima(grid).overall() is None
     assert RunningMoments().summary(1.0) is None
 
 
@@ -208,7 +208,7 @@ def test_topics_know_what_is_missing(numbers: dict[str, Any]) -> None:
     assert topic["missing"] == 39
     assert topic["silences"] == 1
     assert topic["longest_silence_s"] == pytest.approx(0.8, abs=0.03)
-    assert (topic["skipped"], topic["lost"], topic["refused"]) == (5, 2, 1)
+    assert (topic["skipped"], topic["lost"], topic["refused"]) == (7, 0, 1)
     assert numbers["topics"]["sheet_target"]["missing"] == 0
 
 
@@ -238,9 +238,27 @@ def test_a_busy_computer_is_the_first_finding(tmp_path: Path) -> None:
     assert first.gravity == "bad"
     assert first.text.startswith(
         "In 50% of the time the computer main is busy: twin_arms waits for a processor 61% of the "
-        "time; cores in use: chromium 1.3 (at worst). An arm stopped following once; "
-        "overload is the probable cause."
+        "time; cores in use: chromium 1.3 (at worst). Probable consequences: an arm "
+        "stopped following once; messages of these topics were lost or delayed: arm_left. "
+        "What to do: "
     )
+
+
+def test_an_overload_is_one_finding_for_all_topics(numbers: dict[str, Any]) -> None:
+    def section(hosts: dict[str, Any]) -> list[str]:
+        found = find_problems(numbers | {"hosts": hosts})
+        return [one.text for one in found if one.section == "topics"]
+
+    busy = {"busy_fraction": 0.5, "busy_at_worst": "main is busy", "busy_remedy": "close programs",
+            "missing_devices": []}  # fmt: skip
+    assert len(section({})) > 2
+    assert section({"main": busy}) == [
+        "fingertip: 1 messages were refused by their readers.",
+    ]
+    first = find_problems(numbers | {"hosts": {"main": busy, "left": busy}})[0].text
+    assert first.count("In 50% of the time main is busy (at worst).") == 2
+    assert first.count("close programs") == 1
+    assert first.count("fingertip") == 1
 
 
 def test_an_arm_that_starts_is_no_event_and_no_fault(tmp_path: Path) -> None:
@@ -495,7 +513,7 @@ def test_the_command_writes_beside_the_bag_and_over_reports_only(
 def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
     def counted(gaps: int) -> PortStatus:
         return PortStatus(
-            topic="fingertip", rate_hz=50.0, age_s=0.01, messages=90, dropped=0, gaps=gaps,
+            topic="twin/finger", rate_hz=50.0, age_s=0.01, messages=90, dropped=0, gaps=gaps,
             rejected=0,
         )  # fmt: skip
 
@@ -504,6 +522,16 @@ def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
         for gaps in (5, 8):
             port.add("planner", 1, counted(gaps), started_earlier=started_earlier)
         assert port.totals() == (0, lost, 0)
+
+
+def test_a_gap_of_a_topic_with_the_delivery_latest_is_not_a_loss() -> None:
+    for topic, totals in (("fingertip", (3, 0, 1)), ("twin/finger", (1, 2, 1))):
+        port = PortTotals(Spread(Grid(0, 1.0, 1)))
+        status = PortStatus(
+            topic=topic, rate_hz=50.0, age_s=0.01, messages=90, dropped=1, gaps=2, rejected=1
+        )
+        port.add("planner", 1, status, started_earlier=False)
+        assert port.totals() == totals
 
 
 def test_a_single_value_is_a_point_of_the_chart() -> None:

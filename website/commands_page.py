@@ -1,35 +1,36 @@
-"""Generate the reference of the command line: all commands with arguments, options and examples."""
+"""Generate the reference of all commands, and the tables of their errors and notes."""
 
 from __future__ import annotations
 
 import inspect
 from typing import Any
 
+from flexsheet.launch.commands.explain import entries
 from flexsheet.launch.commands.man import list_commands
 from flexsheet.launch.commands.output import examples_in
+from flexsheet.messages.notes import FINGERTIP_REMEDIES, SELF_CHECK_FINDINGS, SELF_CHECK_REMEDIES
+from website.messages_page import format_table
 
 
 def render() -> str:
     """Return a list of links, and a section for each command."""
     by_name = dict(list_commands())
-    links = "\n".join(f"- [`flexsheet {name}`](#flexsheet-{anchor(name)})" for name in by_name)
+    links = "\n".join(
+        f"- [`flexsheet {name}`](#flexsheet-{name.replace(' ', '-')})" for name in by_name
+    )
     return "\n".join([links + "\n", *(_section(name, one) for name, one in by_name.items())])
-
-
-def anchor(name: str) -> str:
-    return name.replace(" ", "-")
 
 
 def _section(name: str, command: Any) -> str:
     calls = "\n".join(examples_in(command.epilog))
     rows = [
-        f"| {_name(parameter)} | {_description(parameter)} |"
+        (_name(parameter), _description(parameter))
         for parameter in command.params
         if "completion" not in parameter.name and not getattr(parameter, "hidden", False)
     ]
-    table = "\n".join(["| argument or option | what |", "| --- | --- |", *rows])
+    table = format_table(("argument or option", "what"), rows)
     text = inspect.cleandoc(command.help or "")
-    return f"## flexsheet {name}\n\n{text}\n\n```sh\n{calls}\n```\n\n{table}\n"
+    return f"## flexsheet {name}\n\n{text}\n\n```sh\n{calls}\n```\n\n{table}"
 
 
 def _name(parameter: Any) -> str:
@@ -51,3 +52,27 @@ def _description(parameter: Any) -> str:
     if "/launch/" in default:
         default = "launch/" + default.rpartition("/launch/")[2]
     return f"{text} Default: `{default}`."
+
+
+def render_errors() -> str:
+    """Return the tables of errors, notes, reasons and causes."""
+    full, short = ("code", "meaning", "what to do"), "what to do"
+    errors = [(f"`{one.code}`", one.meaning, one.remedy) for one in entries() if one.name]
+    notes = [(f"`{one.code}`", f"`{one.phrase}`", one.remedy) for one in entries() if one.phrase]
+    reasons = [(f"`{reason}`", remedy) for reason, remedy in FINGERTIP_REMEDIES.items()]
+    causes = [
+        (f"`{cause}`", finding, SELF_CHECK_REMEDIES[cause])
+        for cause, finding in SELF_CHECK_FINDINGS.items()
+    ]
+    return "\n".join(
+        [
+            "## Errors of commands and nodes\n",
+            format_table(full, errors),
+            "## Notes of nodes\n",
+            format_table(full, notes),
+            "## Reasons of an invalid fingertip\n",
+            format_table(("`reason`", short), reasons),
+            "## Causes that self-checks suspect\n",
+            format_table(("`cause`", "meaning", short), causes),
+        ]
+    )

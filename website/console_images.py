@@ -60,7 +60,7 @@ KNOTS = (
     (6.9, 0.02, 0.0, 0.016),
     (8.0, -0.02, 0.0, 0.012),
 )
-"""Points of the finger's path on the cylinder; the last equals the first, so that it repeats."""
+"""The points of the finger's path on the cylinder. The last point equals the first point."""
 
 PATH_S = KNOTS[-1][0]
 FRAMES_PER_S = 12
@@ -72,7 +72,10 @@ PAGE_PX = (1200, 760)
 
 
 def finger_path(scene: Scene, number: int) -> FingerPath:
-    """Make the path of the finger on the cylinder; number: distinguishes its repetitions."""
+    """Make the path of the finger on the cylinder.
+
+    number: number of the repetition.
+    """
     radius_m = require_cylinder(scene).radius_m
     knots = np.array(KNOTS)
     distance_m = radius_m - knots[:, 3]
@@ -90,7 +93,7 @@ def finger_path(scene: Scene, number: int) -> FingerPath:
 
 
 def record(bag: Path) -> None:
-    """Record two passes of the finger; the second one has no approach."""
+    """Record two passes of the finger. The second pass has no approach."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for number in range(2):

@@ -20,11 +20,14 @@ KEY = re.compile(r"([^.\[\]]+)|\[([^\]]+)\]")
 
 
 class FigureError(ValueError):
-    """Error: a page names a value that no result contains."""
+    """Raised if a page names a value that no result contains."""
 
 
 def update(text: str, folder: Path = RESULTS) -> str:
-    """Return a page with the current values of its figures.  Raises FigureError."""
+    """Return a page with the current values of the figures.
+
+    Raises FigureError if a result does not contain a value.
+    """
     return FIGURE.sub(lambda match: _render(match, folder) + match[0][len(match["shown"]) :], text)
 
 

@@ -19,7 +19,7 @@ NETWORK_RESOURCE = re.compile(r'(?:src|srcset)="https?://[^"]*"|<link[^>]*href="
 
 
 class NetworkError(ValueError):
-    """Error: a page loads a resource from the network."""
+    """Raised if a page loads a resource from the network."""
 
 
 def finish(site: Path, project: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Generate the reference of messages from the topic table and the message types."""
+"""Generate the reference of topics and message types, and of the topics of ROS 2."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from flexsheet.launch.ros2.inputs import INPUTS
+from flexsheet.launch.ros2.mapping import OWN_PREFIX, list_ros_topics
 from flexsheet.messages.base import Header
 from flexsheet.messages.field_types import describe_field_type
 from flexsheet.messages.topics import TOPICS, Topic
@@ -134,3 +136,23 @@ def format_table(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str
     """Return a Markdown table."""
     lines = [heads, tuple("---" for _ in heads), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + "\n"
+
+
+def render_ros2_topics() -> str:
+    """Return the table of ROS topics by topic and field."""
+    rows = []
+    for topic in TOPICS.values():
+        for ros_topic, view in list_ros_topics(topic):
+            if view is not None:
+                rows.append((f"`{topic.name}`", view.fields, f"`{ros_topic.name}`", view.ros_type))
+    rows.append(("each", "all except images", f"`{OWN_PREFIX}TOPIC`", "flexsheet_msgs/msg/TYPE"))
+    return format_table(("topic", "fields", "ROS topic", "ROS type"), rows)
+
+
+def render_ros2_inputs() -> str:
+    """Return the table of inputs from ROS 2."""
+    rows = [
+        (f"`{one.ros_topic.name}`", one.ros_topic.ros_type, f"`{one.topic}`", one.about)
+        for one in INPUTS.values()
+    ]
+    return format_table(("ROS topic", "ROS type", "topic", "meaning"), rows)

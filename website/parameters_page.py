@@ -11,7 +11,7 @@ from flexsheet.messages.field_types import describe_field_type
 from flexsheet.messages.units import find_unit
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.node import find_parameters_type
-from website.messages_page import nested_models, type_section
+from website.messages_page import format_table, nested_models, type_section
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -28,12 +28,17 @@ def _section(name: str) -> str:
     kind = node_class(name)
     about = (kind.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
     rows = [
-        f"| `{key}` | {describe_field_type(field)} | {find_unit(key)} | {_default(field)} | "
-        f"{field.description or ''} |"
+        (
+            f"`{key}`",
+            describe_field_type(field),
+            find_unit(key),
+            _default(field),
+            field.description or "",
+        )
         for key, field in find_parameters_type(kind).model_fields.items()
     ]
-    table = ["| parameter | type | unit | default | what |", "| --- | --- | --- | --- | --- |"]
-    return f"## {name}\n\n{' '.join(about.split())}\n\n" + "\n".join([*table, *rows]) + "\n"
+    table = format_table(("parameter", "type", "unit", "default", "what"), rows)
+    return f"## {name}\n\n{' '.join(about.split())}\n\n{table}"
 
 
 def _default(field: Any) -> str:

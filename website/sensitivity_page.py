@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.nodes.twin.tolerance_table import Profile
+from website.messages_page import format_table
 
 ROWS_PER_PROFILE = 16
 METRICS = {
@@ -34,10 +35,8 @@ def render(results: Path) -> str:
             row = (f"`{one['parameter']}`", *effects, f"{one['share']:.2f}")
             profiles.setdefault(row, []).append(f"`{profile.value}`")
         notes.append(f"{record['machine']}; `{record['command']}`.\n")
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    for row, names in profiles.items():
-        lines.append(f"| {' | '.join((row[0], ', '.join(names), *row[1:]))} |")
-    return "\n".join([*lines, "", *notes])
+    rows = [(row[0], ", ".join(names), *row[1:]) for row, names in profiles.items()]
+    return "\n".join([format_table(heads, rows), *notes])
 
 
 def _format_effects(found: dict[str, Any], parameter: str) -> list[str]:

@@ -9,16 +9,11 @@ from typing import Any
 
 from flexsheet.launch.methods.configurations import CONTROL_AGAIN
 from flexsheet.launch.methods.system_picture import draw_system_chart
+from website.messages_page import format_table
+from website.sensitivity_page import METRICS
 
 SYSTEM = "system.json"
 PARTS = ("points", "front")
-COLUMNS = {
-    "sheet_mm": "sheet, mm",
-    "image_mm": "image, mm",
-    "force_percent": "force, %",
-    "fingertip_mm": "fingertip, mm",
-}
-"""The headings of the 95 % errors in a point of the system chart."""
 
 
 def draw(results: Path, images: Path) -> None:
@@ -31,22 +26,24 @@ def draw(results: Path, images: Path) -> None:
 
 def render_system(results: Path) -> str:
     """Return a table with the configurations of each scene in the system chart, in Markdown."""
-    heads = ("scene", "configuration", "cores", "to arm, ms", "to light, ms", *COLUMNS.values())
-    lines = [f"| {' | '.join((*heads, 'exceeds'))} |", "|---" * (len(heads) + 1) + "|"]
+    heads = ("scene", "configuration", "cores", "to arm, ms", "to light, ms", *METRICS.values(),
+             "exceeds")  # fmt: skip
+    rows = []
     record = _read(results / SYSTEM)
     for point in record["results"]["points"]:
         if point["configuration"] == CONTROL_AGAIN:
             continue
-        cells = [
+        cells = (
             point["scene"],
             point["configuration"],
             f"{point['cpu_cores']:.2f}",
             *(_format_latency(point[f"exposure_to_{end}_ms"]) for end in ("arm", "light")),
-            *("–" if point[key] is None else f"{point[key]:.2f}" for key in COLUMNS),
+            *("–" if point[key] is None else f"{point[key]:.2f}" for key in METRICS),
             ", ".join(key.removesuffix(".p95") for key in point["failing"]) or "–",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, "", _describe(record)])
+        )
+        rows.append(cells)
+    machine = f"{record['machine']}, load {record['load']:.1f}; `{record['command']}`."
+    return f"{format_table(heads, rows)}\n{machine}"
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -56,7 +53,3 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _format_latency(quantiles: Mapping[str, float] | None) -> str:
     return "–" if quantiles is None else f"{quantiles['p50']:.0f} / {quantiles['p99']:.0f}"
-
-
-def _describe(record: Mapping[str, Any]) -> str:
-    return f"{record['machine']}, load {record['load']:.1f}; `{record['command']}`."

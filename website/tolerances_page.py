@@ -16,21 +16,20 @@ from flexsheet.nodes.twin.tolerance_table import (
     Uniform,
     expand_key,
 )
+from website.messages_page import format_table
 
 
 def render() -> str:
     """Return the table; values that the simulator does not use have a mark."""
-    lines = [
-        "| parameter | unit | `modern` | `paper` | source | calibrated | source |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    heads = ("parameter", "unit", "`modern`", "`paper`", "source", "calibrated", "source")
+    rows = []
     for row in TOLERANCES.values():
         mark = " †" if any(path in NOT_SIMULATED for path in expand_key(row.key)) else ""
         paper = "" if row.paper is None else _describe(row, Profile.PAPER, calibrated=False)
         calibrated = "as before"
         if row.calibrated is not None:
             calibrated = _describe(row, Profile.MODERN, calibrated=True)
-        cells = [
+        cells = (
             f"`{row.key}`{mark}",
             row.unit,
             _describe(row, Profile.MODERN, calibrated=False),
@@ -38,9 +37,9 @@ def render() -> str:
             row.source,
             calibrated,
             row.calibrated_source,
-        ]
-        lines.append(f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |")
-    return "\n".join(lines) + "\n"
+        )
+        rows.append(tuple(cell.replace("|", "&#124;") for cell in cells))
+    return format_table(heads, rows)
 
 
 def _describe(row: Tolerance, profile: Profile, *, calibrated: bool) -> str:

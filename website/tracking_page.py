@@ -9,6 +9,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from website.messages_page import format_table
+
 Case = dict[str, Any]
 
 
@@ -56,10 +58,9 @@ def _summarise(ratios: Sequence[float]) -> str:
 def _table(first: str, rows: Sequence[tuple[str, Sequence[Case]]]) -> str:
     names = [f"`{name}`" for name in rows[0][1][0]["error_mm"]]
     bounds = ["`adaptive` over its best model", "`adaptive` over known spectrum"]
-    header = [first, *names, *bounds]
-    lines = [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
-    lines += [f"| {' | '.join([label, *_ratios(cases)])} |" for label, cases in rows]
-    return "\n".join(lines) + "\n"
+    return format_table(
+        (first, *names, *bounds), [(label, *_ratios(cases)) for label, cases in rows]
+    )
 
 
 def _by_measurement(cases: Sequence[Case]) -> str:

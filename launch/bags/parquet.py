@@ -134,7 +134,8 @@ def _columns_of_value(
         return
     if origin is tuple and split_annotation(arguments[0])[1] is not None:
         if images:  # a tuple of one image or none
-            yield from _columns_of_value(arguments[0], name, _first(get), about, images)
+            first = _applied(get, lambda values: values[0] if values else None)
+            yield from _columns_of_value(arguments[0], name, first, about, images)
         return
     yield Column(name, _find_type(inner), _applied(get, _make_conversion(inner)), about)
 
@@ -147,8 +148,9 @@ def _columns_of_array(
     if is_image(spec):
         if images:
             yield Column(name, arrow.binary(), _applied(get, lambda image: image.tobytes()), about)
-            for axis, size in enumerate(("height", "width")):
-                yield Column(f"{name}.{size}", arrow.int64(), _size(get, axis), {})
+            size = _applied(get, lambda image: image.shape)
+            for axis, part in enumerate(("height", "width")):
+                yield Column(f"{name}.{part}", arrow.int64(), _at(size, axis), {})
     elif spec.shape == (4, 4):
         yield from (
             Column(f"{name}.{part}", element, _at(_applied(get, split_pose), i), about)
@@ -234,14 +236,6 @@ def _applied(get: Get, function: Callable[[Any], Any]) -> Get:
 
 def _at(get: Get, index: int) -> Get:
     return _applied(get, lambda values: values[index])
-
-
-def _first(get: Get) -> Get:
-    return _applied(get, lambda values: values[0] if values else None)
-
-
-def _size(get: Get, axis: int) -> Get:
-    return _applied(get, lambda image: image.shape[axis])
 
 
 class TableBuilder:

@@ -325,9 +325,9 @@ def sheet_errors(session: Session) -> Chart | None:
     grid[0][0].legend(fontsize=8)
     grid[1][0].set_xlabel("time in the bag, s")
     worst = [
-        f"against the {label} {1e3 * overall[1]:.2f} mm"
+        f"against the {label} {1e3 * overall:.2f} mm"
         for name, label in shown
-        if (overall := errors.distance[name].overall())
+        if (overall := errors.distance[name].overall()) is not None
     ]
     return Chart(
         render_svg(figure),
@@ -344,7 +344,9 @@ def draw_joint_speeds(session: Session) -> Chart | None:
 
     Return None if the bag contains no joint speeds.
     """
-    arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
+    arms = {
+        side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall() is not None
+    }
     if not arms:
         return None
     figure, grid = _figure(len(arms), 1, 2.3 * len(arms) + 0.3)
@@ -362,11 +364,11 @@ def draw_joint_speeds(session: Session) -> Chart | None:
         axes.set_ylim(bottom=0.0)
         _over_time(axes, session)
         percents = [
-            100.0 * overall[1] / limit
+            100.0 * overall / limit
             for range_, limit in zip(
                 arm.joint_speed, session.joint_speeds_rad_per_s(side), strict=True
             )
-            if (overall := range_.overall())
+            if (overall := range_.overall()) is not None
         ]
         texts.append(f"{side} arm at most {max(percents):.0f} %")
     grid[0][0].legend(fontsize=8, ncols=7, loc="upper right")
@@ -383,7 +385,7 @@ def forces(session: Session) -> Chart | None:
 
     Return None if the bag contains no edge forces.
     """
-    arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
+    arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall() is not None}
     if not arms:
         return None
     figure, grid = _figure(2, 1, 4.4)
@@ -394,7 +396,7 @@ def forces(session: Session) -> Chart | None:
         upper.plot(seconds, arm.edge_force.maximum, color=COLOURS[4 * i], linewidth=1.2,
                    linestyle=("-", "--")[i], label=f"{side} edge")  # fmt: skip
         overall = arm.edge_force.overall()
-        texts.append(f"{side} edge at most {overall[1]:.1f} N" if overall else side)
+        texts.append(f"{side} edge at most {overall:.1f} N")
     if session.scene is not None:
         most_n = session.scene.sheet.max_edge_force_n
         upper.axhline(most_n, linestyle="--", color=INK, linewidth=1.0, label="limit")

@@ -55,44 +55,51 @@ CHECKED = (
 def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
     """Return all problems in a recorded session.
 
-    An overload of a computer is first, because it causes most other problems. Failures are next,
+    An overload of the computers is first, because it causes most other problems. Failures are next,
     and possible problems are last.
 
     numbers: result of `compute_numbers`.
     """
+    flow = {name: list(_check_flow(name, topic)) for name, topic in numbers["topics"].items()}
+    overload = _check_load(numbers, [name for name, found in flow.items() if found])
     found = [
         *_check_bag(numbers),
         *_check_arms(numbers),
         *_check_nodes(numbers),
-        *_check_topics(numbers),
+        *_check_refused(numbers),
+        # An overload affects many topics, so one finding lists all of them.
+        *([] if overload else (one for found in flow.values() for one in found)),
         *_check_tolerances(numbers),
         *_check_finger(numbers),
     ]
-    others = sorted(found, key=lambda one: one.gravity != "bad")
-    return [*_check_load(numbers, others), *others]
+    return [*overload, *sorted(found, key=lambda one: one.gravity != "bad")]
 
 
 def _times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
 
-def _check_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterator[SessionFinding]:
-    """Yield a problem for each computer that was overloaded.
+def _check_load(numbers: dict[str, Any], affected: list[str]) -> list[SessionFinding]:
+    """Return one problem if any computer was overloaded, otherwise an empty list.
 
-    others: other problems of the session, which the overload may have caused.
+    affected: names of the topics with lost or delayed messages.
     """
+    hosts = [host for host in numbers["hosts"].values() if host["busy_fraction"]]
+    if not hosts:
+        return []
+    parts = [
+        f"In {host['busy_fraction']:.0%} of the time {host['busy_at_worst']} (at worst)."
+        for host in hosts
+    ]
     stopped = numbers["events"]["counts"].get("arm", 0)
-    for host in numbers["hosts"].values():
-        if not host["busy_fraction"]:
-            continue
-        text = f"In {host['busy_fraction']:.0%} of the time {host['busy_at_worst']} (at worst). "
-        if stopped:
-            text += f"An arm stopped following {_times(stopped)}; overload is the probable cause. "
-        elif others:
-            text += "Overload is the probable cause of the delays. "
-        often = host["busy_fraction"] > BRIEFLY_BUSY_FRACTION
-        gravity: Gravity = "bad" if stopped or often else "doubtful"
-        yield SessionFinding(gravity, f"{text}What to do: {host['busy_remedy']}.", "bag")
+    effects = [f"an arm stopped following {_times(stopped)}"] if stopped else []
+    if affected:
+        effects.append(f"messages of these topics were lost or delayed: {', '.join(affected)}")
+    if effects:
+        parts.append(f"Probable consequences: {'; '.join(effects)}.")
+    parts.append(f"What to do: {'; '.join(dict.fromkeys(host['busy_remedy'] for host in hosts))}.")
+    often = max(host["busy_fraction"] for host in hosts) > BRIEFLY_BUSY_FRACTION
+    return [SessionFinding("bad" if stopped or often else "doubtful", " ".join(parts), "bag")]
 
 
 MAX_TOPICS_LISTED = 10
@@ -177,25 +184,29 @@ def _check_nodes(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
             yield SessionFinding("doubtful", f"{text.rstrip(' :')}.", "nodes")
 
 
-def _check_topics(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
+def _check_refused(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for name, topic in numbers["topics"].items():
-        expected, rate = topic["expected_hz"], topic["rate_hz"]
         if topic["refused"]:
             text = f"{name}: {topic['refused']} messages were refused by their readers."
             yield SessionFinding("bad", text, "topics")
-        if topic["lost"]:
-            text = f"{name}: {topic['lost']} messages were lost between writer and readers."
-            yield SessionFinding("doubtful", text, "topics")
-        if topic["missing"]:
-            text = f"{name}: {topic['missing']} messages never reached the recorder."
-            yield SessionFinding("doubtful", text, "topics")
-        if expected and rate and topic["messages"] > 10 and rate < SLOW_RATIO * expected[0]:
-            text = f"{name} had a rate of {rate:.3g} Hz; at least {expected[0]:.3g} Hz is expected."
-            yield SessionFinding("doubtful", text, "topics")
-        if topic["silences"]:
-            gap_s = topic["longest_silence_s"]
-            text = f"{name} stopped {_times(topic['silences'])}, for at most {gap_s:.2f} s."
-            yield SessionFinding("doubtful", text, "topics")
+
+
+def _check_flow(name: str, topic: dict[str, Any]) -> Iterator[SessionFinding]:
+    """Yield the lost and delayed messages of a topic, which an overload can cause."""
+    expected, rate = topic["expected_hz"], topic["rate_hz"]
+    if topic["lost"]:
+        text = f"{name}: {topic['lost']} messages were lost between writer and readers."
+        yield SessionFinding("doubtful", text, "topics")
+    if topic["missing"]:
+        text = f"{name}: {topic['missing']} messages never reached the recorder."
+        yield SessionFinding("doubtful", text, "topics")
+    if expected and rate and topic["messages"] > 10 and rate < SLOW_RATIO * expected[0]:
+        text = f"{name} had a rate of {rate:.3g} Hz; at least {expected[0]:.3g} Hz is expected."
+        yield SessionFinding("doubtful", text, "topics")
+    if topic["silences"]:
+        gap_s = topic["longest_silence_s"]
+        text = f"{name} stopped {_times(topic['silences'])}, for at most {gap_s:.2f} s."
+        yield SessionFinding("doubtful", text, "topics")
 
 
 def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flexsheet.launch.bags.report.series import Range, Spread, States
+from flexsheet.launch.bags.report.series import Maxima, Spread, States
 from flexsheet.launch.bags.report.session import Arm, HostLoad, NodeSummary, Session
 from flexsheet.launch.bags.report.strokes import FingerRun
 from flexsheet.messages.busy import describe_busy, describe_busy_remedy
@@ -169,7 +169,7 @@ def _arm(arm: Arm, limits_rad_per_s: Sequence[float]) -> dict[str, Any]:
     return {
         "modes_s": _states(arm.modes),
         "joint_speed_ratio": [
-            None if peak is None else peak[1] / limit
+            None if peak is None else peak / limit
             for peak, limit in zip(peaks, limits_rad_per_s, strict=True)
         ],
         "tool_speed_mm_per_s": _most(arm.tool_speed, 1e3),
@@ -236,6 +236,6 @@ def _spread_ms(spread: Spread) -> dict[str, float | int | None]:
     return {**scaled, "max": None if longest is None else 1e3 * longest, "count": spread.count}
 
 
-def _most(range_: Range, scale: float) -> float | None:
+def _most(range_: Maxima, scale: float) -> float | None:
     overall = range_.overall()
-    return None if overall is None else scale * overall[1]
+    return None if overall is None else scale * overall

@@ -262,8 +262,9 @@ def _topics(numbers: Mapping[str, Any]) -> Iterator[str]:
         )
     yield table(
         "Age: time from the source timestamp until the message is read, or recorded if there is no "
-        "other reader. Skipped: intentionally replaced by a newer message before it was read. "
-        "Lost: on the way from writer to readers. Missing: not in the bag. Refused: invalid.",
+        "other reader. Skipped: intentionally replaced by a newer message before it was read, or "
+        "dropped from the queue of a topic with the delivery latest. Lost: on the way from writer "
+        "to readers. Missing: not in the bag. Refused: invalid.",
         ("topic", "messages", "Hz", "expected, Hz", "age, ms", "age 99 %, ms",
          "maximum gap, s", "skipped", "lost", "missing", "refused"),
         rows,

@@ -47,25 +47,20 @@ class Grid:
         return np.asarray(middles * (self.duration_s / self.count))
 
 
-class Range:
-    """The minimum and maximum of a quantity in each interval, or NaN without values."""
+class Maxima:
+    """The maximum of a quantity in each interval, or NaN without values."""
 
     def __init__(self, grid: Grid) -> None:
-        self.minimum = np.full(grid.count, np.nan)
         self.maximum = np.full(grid.count, np.nan)
 
     def add(self, index: int, value: float) -> None:
         # The negated comparison is also true if the stored value is NaN, its initial value.
-        if not value >= self.minimum[index]:
-            self.minimum[index] = value
         if not value <= self.maximum[index]:
             self.maximum[index] = value
 
-    def overall(self) -> tuple[float, float] | None:
-        """Return the minimum and maximum over all intervals, or None without values."""
-        if np.isnan(self.maximum).all():
-            return None
-        return float(np.nanmin(self.minimum)), float(np.nanmax(self.maximum))
+    def overall(self) -> float | None:
+        """Return the maximum over all intervals, or None without values."""
+        return None if np.isnan(self.maximum).all() else float(np.nanmax(self.maximum))
 
 
 class Spread:

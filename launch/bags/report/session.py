@@ -16,8 +16,8 @@ from flexsheet.launch.bags.report.album import Album
 from flexsheet.launch.bags.report.series import (
     Events,
     Grid,
+    Maxima,
     PointSeries,
-    Range,
     RunningMoments,
     Spread,
     States,
@@ -30,7 +30,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.busy import is_busy
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.scene import RV_1A, Scene
-from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.topics import TOPICS, Delivery
 from flexsheet.messages.types import (
     ArmState,
     Bookmark,
@@ -48,7 +48,7 @@ from flexsheet.messages.types import (
     TwinFinger,
 )
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.arrays import Floats, Ints
 
 Progress = Callable[[float, float], None]
 
@@ -110,9 +110,7 @@ class PortTotals:
 
     age: Spread
     newest: dict[str, tuple[int, PortStatus]] = field(default_factory=dict)
-    skipped: int = 0
-    lost: int = 0
-    refused: int = 0
+    offset: Ints = field(default_factory=lambda: np.zeros(3, np.int64))
 
     def add(self, node: str, epoch: int, port: PortStatus, *, started_earlier: bool) -> None:
         """Add the message counters that a subscriber reports.
@@ -123,26 +121,30 @@ class PortTotals:
         """
         before = self.newest.get(node)
         if before is not None and before[0] != epoch:
-            self._add_counts(before[1], 1)
+            self.offset += count_undelivered(before[1])
         if before is None and started_earlier:
-            self._add_counts(port, -1)
+            self.offset -= count_undelivered(port)
         self.newest[node] = (epoch, port)
         if port.age_s is not None:
             self.age.add(0, port.age_s)
 
-    def _add_counts(self, port: PortStatus, sign: int) -> None:
-        self.skipped += sign * port.dropped
-        self.lost += sign * port.gaps
-        self.refused += sign * port.rejected
-
     def totals(self) -> tuple[int, int, int]:
         """Return the numbers of messages that all subscribers skipped, lost and refused."""
-        now = [port for _, port in self.newest.values()]
-        return (
-            self.skipped + sum(port.dropped for port in now),
-            self.lost + sum(port.gaps for port in now),
-            self.refused + sum(port.rejected for port in now),
-        )
+        now = [count_undelivered(port) for _, port in self.newest.values()]
+        skipped, lost, refused = sum(now, self.offset).tolist()
+        return skipped, lost, refused
+
+
+def count_undelivered(port: PortStatus) -> Ints:
+    """Return the numbers (3,) of messages that a subscriber skipped, lost and refused.
+
+    A queue of a topic with the delivery `latest` is short, because only the newest message is
+    needed. Messages that this queue drops are therefore counted as skipped and not as lost.
+    """
+    topic = TOPICS.get(port.topic)
+    if topic is not None and topic.delivery is Delivery.LATEST:
+        return np.array([port.dropped + port.gaps, 0, port.rejected])
+    return np.array([port.dropped, port.gaps, port.rejected])
 
 
 @dataclass(slots=True)
@@ -205,8 +207,8 @@ class Arm:
 
     def __init__(self, grid: Grid, fine: Grid) -> None:
         self.modes = States(fine, MODES)
-        self.joint_speed = [Range(grid) for _ in range(6)]
-        self.tool_speed, self.edge_force = Range(grid), Range(grid)
+        self.joint_speed = [Maxima(grid) for _ in range(6)]
+        self.tool_speed, self.edge_force = Maxima(grid), Maxima(grid)
         self.cycle = Spread(Grid(0, 1.0, 1))
         self.faults: tuple[str, ...] = ()
         self.bridge = ""
@@ -271,7 +273,7 @@ class Session:
         self.reasons: dict[str, int] = {}
         self.finger_path, self.true_path = PointSeries(self.fine), PointSeries(self.fine)
         self.sheet_path = PointSeries(self.fine)
-        self.push, self.force = Range(self.grid), Range(self.grid)
+        self.push, self.force = Maxima(self.grid), Maxima(self.grid)
         self.body_methods: dict[str, int] = {}
         self.out_of_range = 0
         self.corrections: dict[str, int] = {}

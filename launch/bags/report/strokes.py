@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
-from flexsheet.launch.bags.report.series import Grid, Range, RunningMoments
+from flexsheet.launch.bags.report.series import Grid, Maxima, RunningMoments
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     make_edge_row,
@@ -150,8 +150,8 @@ class SheetErrors:
         self._following: list[tuple[int, Floats]] = []
         self._arms: dict[str, tuple[int, bool]] = {}
         self._target_holds = True
-        self.distance = {"measured": Range(grid), "true": Range(grid)}
-        self.angle = {"measured": Range(grid), "true": Range(grid)}
+        self.distance = {"measured": Maxima(grid), "true": Maxima(grid)}
+        self.angle = {"measured": Maxima(grid), "true": Maxima(grid)}
         self.contact = {name: RunningMoments() for name in ("d", "theta", "true_d", "true_theta")}
         self.runs: list[FingerRun] = []
 

@@ -53,7 +53,7 @@ MIN_THICKNESS_SPACINGS = 4.0
 """The minimum thickness of the object, in skin spacings. It corresponds to two elements."""
 MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
-"""The maximum memory (bytes) per node during meshing, as measured by `benchmarks.meshing`."""
+"""The maximum memory (bytes) per node during meshing, as measured."""
 SAMPLES = 16
 """The number of samples per side of the bounding box in the estimate of the number of nodes."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0

@@ -120,7 +120,7 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
     triangles (t, 3): indices of vertices.
 
     With a shorter length, users would feel the facets. With a longer length, curved parts would be
-    flattened. `benchmarks.shapes` measures both effects.
+    flattened.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
