@@ -341,6 +341,7 @@ def test_results_go_into_scene_and_launch_file(tmp_path: Path) -> None:
 def test_a_scene_with_a_mesh_stays_valid_in_the_folder(tmp_path: Path) -> None:
     lab = Commissioning(tmp_path, DEMO, SCENE_FILE.parent / "organ.yaml", None)
     lab.write()
+    assert lab.expected_s(StepName.CAMERA) is None
     organ = load_scene(SCENE_FILE.parent / "organ.yaml")
     assert identify_scene(load_scene(lab.scene_copy)) == identify_scene(organ)
 
@@ -360,6 +361,7 @@ def test_a_commissioning_resumes_and_a_repeated_step_invalidates_later_ones(
     again = open_lab(tmp_path)
     assert again.pending() == list(StepName)[3:]
     assert again.state == lab.state
+    assert again.expected_s(StepName.CAMERA) == lab.state.steps[StepName.CAMERA].seconds
     again.run(StepName.CAMERA, step)
     assert again.pending() == list(StepName)[1:]
     assert load_scene(again.scene_copy).finger.radius_m == 0.009
@@ -699,8 +701,10 @@ def test_the_command_runs_skips_repeats_and_checks(
     tmp_path: Path, quick_steps: list[StepName]
 ) -> None:
     folder = ("--apparatus", "seed:3", "--output", str(tmp_path / "lab"))
-    code, found, _ = invoke(*folder, "--skip", "marker=the finger is not here")
+    code, found, printed = invoke(*folder, "--skip", "marker=the finger is not here")
     assert code == 0
+    assert "step projector, about 8 s\n" in printed
+    assert "step verification\n" in printed
     assert found["complete"]
     assert quick_steps == [name for name in StepName if name is not StepName.MARKER]
     assert [one["name"] for one in found["steps"]] == list(StepName)

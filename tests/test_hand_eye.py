@@ -34,6 +34,7 @@ from flexsheet.launch.calibration.hand_eye import (
     HandEyeError,
     calibrate_base,
 )
+from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.arms_calibration import load_arms_calibration
 from flexsheet.messages.calibration import Board
@@ -327,29 +328,30 @@ def test_a_table_of_board_poses_will_do(tmp_path: Path, unit: str) -> None:
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("", r"has no joint angles \(columns: none\); add the columns j1_deg"),
-        ("left,right,j1_deg\n", "add the columns j1_deg to j6_deg"),
+        ("", "the table has no rows"),
+        ("left,right\na,b\n", r"has no joint angles \(columns: left, right\); add the columns j1"),
+        ("left,right,j1_deg\na,b,0\n", "add the columns j1_deg to j6_deg"),
         (
-            "j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n",
+            "j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n0,0,0,0,0,0\n",
             "neither images nor board poses; add the columns left and right",
         ),
         ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "the table has no rows"),
         (
             "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,x,0,0,0\n",
-            "row 2, column j3_deg: expected a number, found 'x'",
+            'joints.csv:2: j3_deg: expected a finite number, found "x"',
         ),
         (
             "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,0,0,0,nan\n",
-            "row 2, column j6_deg",
+            "joints.csv:2: j6_deg",
         ),
-        ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0\n", "row 2, column j3_deg"),
-        ("\x00\xff", "columns"),
+        ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0\n", "csv:2: j3_deg"),
+        ("\x00\xff", "the table has no rows"),
     ],
 )
 def test_a_bad_table_is_named_to_the_cell(tmp_path: Path, text: str | None, words: str) -> None:
     if text is not None:
         (tmp_path / TABLE).write_text(text)
-    with pytest.raises(ArmPosesError, match=words):
+    with pytest.raises((ArmPosesError, BadInputError), match=words):
         read_pose_table(tmp_path)
 
 

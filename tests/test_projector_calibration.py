@@ -148,27 +148,21 @@ def test_points_that_make_no_calibration_are_rejected(
     scene: Scene, points: ProjectorPoints
 ) -> None:
     def some(keep: np.ndarray) -> ProjectorPoints:
-        return ProjectorPoints(
-            points.world[keep], points.pixels[keep], points.pose[keep], points.skew_m[keep]
-        )
+        return ProjectorPoints(points.world[keep], points.pixels[keep], points.pose[keep])
 
     with pytest.raises(ProjectorError, match="in 2 poses"):
         calibrate_projector(some(points.pose < 2), scene.projector)
     flat = points.world * [1.0, 1.0, 0.0]
     with pytest.raises(ProjectorError, match="the depth range of the points"):
-        calibrate_projector(
-            ProjectorPoints(flat, points.pixels, points.pose, points.skew_m), scene.projector
-        )
+        calibrate_projector(ProjectorPoints(flat, points.pixels, points.pose), scene.projector)
     near = np.linalg.norm(points.pixels - points.pixels.mean(axis=0), axis=1) < 60
     corner = ProjectorPoints(*(np.repeat(part[near], 6, axis=0) for part in (
-        points.world, points.pixels, points.pose, points.skew_m)))  # fmt: skip
+        points.world, points.pixels, points.pose)))  # fmt: skip
     with pytest.raises(ProjectorError, match="% of the projector's image"):
         calibrate_projector(corner, scene.projector)
     moved = points.world + np.where(points.pose == 1, 0.01, 0.0)[:, None]
     with pytest.raises(ProjectorError, match="keep the sheet still"):
-        calibrate_projector(
-            ProjectorPoints(moved, points.pixels, points.pose, points.skew_m), scene.projector
-        )
+        calibrate_projector(ProjectorPoints(moved, points.pixels, points.pose), scene.projector)
     with pytest.raises(ProjectorError, match="0 points"):
         calibrate_projector(some(points.pose < 0), scene.projector)
 

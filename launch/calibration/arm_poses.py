@@ -18,7 +18,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.corners import (
     BoardPair,
@@ -28,7 +27,9 @@ from flexsheet.launch.calibration.corners import (
     find_pairs,
     match_views,
 )
+from flexsheet.launch.calibration.csv_rows import parse_finite, read_rows
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CameraLens, CornerView, LensRig
+from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.messages.errors import FlexsheetError
@@ -36,6 +37,7 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Lens as SceneLens
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.types import Side
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.camera.image_pair import encode_png
 from flexsheet.nodes.models.camera import camera_matrix, project
 from flexsheet.nodes.models.rigid import (
@@ -50,9 +52,6 @@ from flexsheet.nodes.twin.arms import ArmMechanics
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 TABLE = "joints.csv"
 JOINTS = tuple(f"j{number}" for number in range(1, 7))
@@ -114,7 +113,7 @@ def _make_camera_lens(lens: SceneLens) -> CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class PoseRow:
-    """A row of the table of arm poses. It contains either two image files or a board pose.
+    """A row of the table of arm poses. The row contains either two image files or a board pose.
 
     joints_rad: joint angles (6,).
     images: left and right image file; None if the row contains a board pose.
@@ -130,28 +129,19 @@ class PoseRow:
 def read_pose_table(folder: Path) -> list[PoseRow]:
     """Read the table of arm poses in a folder.
 
-    Raises ArmPosesError, which names row and column, if the table is missing or invalid.
+    Raises ArmPosesError or BadInputError if the table is missing or invalid.
     """
     path = folder / TABLE
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            columns = tuple(reader.fieldnames or ())
-            lines = list(reader)
-    except OSError as error:
-        raise ArmPosesError(
-            f"{path}: cannot be read: {error.strerror}; docs/arms.md describes the table"
-        ) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ArmPosesError(
-            f"{path}: the file is not valid CSV: {error}; save it as comma-separated values"
-        ) from error
+    lines = read_rows(path, ())
+    if not lines:
+        raise ArmPosesError(f"{path}: the table has no rows; add one row per pose of the arm")
+    columns = [name for name in lines[0][1] if name]
     unit = next(
         (one for one in ("deg", "rad") if all(f"{j}_{one}" in columns for j in JOINTS)), None
     )
     if unit is None:
         raise ArmPosesError(
-            f"{path}: the table has no joint angles (columns: {', '.join(columns) or 'none'}); add "
+            f"{path}: the table has no joint angles (columns: {', '.join(columns)}); add "
             "the columns j1_deg to j6_deg, or j1_rad to j6_rad"
         )
     by_pose = all(name in columns for name in BOARD_COLUMNS)
@@ -160,38 +150,23 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
             f"{path}: the table has neither images nor board poses; add the columns left and "
             f"right, or {', '.join(BOARD_COLUMNS)}"
         )
+    problems: list[Problem] = []
     rows = []
-    for number, line in enumerate(lines, start=2):
-        joints = _parse_numbers(path, number, line, [f"{joint}_{unit}" for joint in JOINTS])
+    for number, (where, line) in enumerate(lines, start=2):
+        joints, pose = (
+            np.array([parse_finite(where, name, line[name], problems) for name in names])
+            for names in ([f"{joint}_{unit}" for joint in JOINTS], BOARD_COLUMNS if by_pose else ())
+        )
         joints_rad = np.radians(joints) if unit == "deg" else joints
         if by_pose:
-            pose = _parse_numbers(path, number, line, BOARD_COLUMNS)
             board = transform(rotation_from_vector(pose[3:]), pose[:3])
             rows.append(PoseRow(f"row {number}", joints_rad, None, board))
         else:
-            images = (folder / (line["left"] or ""), folder / (line["right"] or ""))
+            images = (folder / line["left"], folder / line["right"])
             rows.append(PoseRow(line["left"] or f"row {number}", joints_rad, images, None))
-    if not rows:
-        raise ArmPosesError(f"{path}: the table has no rows; add one row per pose of the arm")
+    if problems:
+        raise BadInputError(problems)
     return rows
-
-
-def _parse_numbers(
-    path: Path, number: int, line: dict[str, str | None], columns: list[str] | tuple[str, ...]
-) -> Floats:
-    values = []
-    for column in columns:
-        text = line[column]
-        try:
-            value = float(text or "")
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise ArmPosesError(
-                f"{path}: row {number}, column {column}: expected a number, found {text!r}"
-            )
-        values.append(value)
-    return np.array(values)
 
 
 def read_detections(
@@ -199,13 +174,13 @@ def read_detections(
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
     """Read the table of arm poses in a folder, and detect the board in the images.
 
-    Return the detections, and (pose name, reason) for each pose in which the board was not
-    detected.
+    Return the detections, and (pose name, reason) for each pose without a detected board.
 
     rig: stereo camera. A board pose in the table is projected into its images.
     size: required (width, height) of the images, px.
 
-    Raises ArmPosesError for an invalid table, and CalibrationError for unusable images.
+    Raises ArmPosesError or BadInputError for an invalid table, and CalibrationError for unusable
+    images.
     """
     rows = read_pose_table(folder)
     if rows[0].images is None:
@@ -239,7 +214,7 @@ def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board
 
 
 def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
-    """Compute the image corners of a board whose pose is known, without noise.
+    """Project the corners of a board with a known pose into both images, without noise.
 
     Raises ArmPosesError if the board is behind a camera.
     """
@@ -357,7 +332,7 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 
 
 class SimulatedArm:
-    """A simulated arm without a sheet, whose base pose and joint angles have errors.
+    """A simulated arm without a sheet, with errors of the base pose and the joint angles.
 
     Without an apparatus (true hardware parameters), the base deviates at random from the scene, and
     each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, the arm has the base

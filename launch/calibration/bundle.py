@@ -14,13 +14,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.corners import BoardPair, BoardView
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import rigid
-
-Floats = NDArray[np.float64]
 
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2")
 PARAMETERS = (
@@ -204,7 +202,7 @@ def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
 
 
 def _scaled_inverse(matrix: Floats) -> Floats:
-    """Invert a symmetric positive definite matrix, whose rows may have very different units.
+    """Invert a symmetric positive definite matrix with different units in its rows.
 
     Raises NotDeterminedError if the matrix is not positive definite or is nearly singular.
     """

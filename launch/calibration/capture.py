@@ -10,15 +10,18 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.bundle import board_pose, pose_transform
-from flexsheet.launch.calibration.corners import BoardPair, CornerFinder, board_points, match_views
+from flexsheet.launch.calibration.corners import (
+    BoardPair,
+    CornerFinder,
+    board_points,
+    match_views,
+    measure_shift_px,
+)
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.scene import Lens
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from flexsheet.nodes.arrays import Floats, Image
 
 COLUMNS, ROWS = 4, 3
 """The numbers of columns and rows of image cells in which the coverage is counted."""
@@ -130,15 +133,17 @@ class Capture:
         if isinstance(pair, str):
             self._before, self._still = None, 0
             return PairAssessment(False, pair)
-        moved_px = np.inf if self._before is None else _measure_shift(pair, self._before)
+        moved_px = (
+            np.inf if self._before is None else measure_shift_px(pair.left, self._before.left)
+        )
         self._before = pair
         self._still = self._still + 1 if moved_px < STILL_PX else 1
-        if any(_measure_shift(pair, one) < NEW_POSE_PX for one in self._accepted):
+        if any(measure_shift_px(pair.left, one.left) < NEW_POSE_PX for one in self._accepted):
             return PairAssessment(False, self._make_hint("pose already captured; "))
         bins = self._find_bins(pair)
         adds = [one for one in bins if self.counts[one] < self.needed.get(one, 0)]
         if not adds:
-            return PairAssessment(False, self._make_hint("no new coverage; "))
+            return PairAssessment(False, self._make_hint("enough pairs show this pose; "))
         if self._still < self._still_images:
             return PairAssessment(False, "keep the board still")
         self.counts.update(bins)
@@ -174,31 +179,33 @@ class Capture:
         """
         missing = self.missing()
         if not missing:
-            return prefix + "coverage complete"
+            return prefix + "all required poses of the board are captured"
         groups = {one.group: one for one in reversed(missing)}
-        for group in ("tilt", "distance"):
-            if group in groups:
-                return f"{prefix}show the board {_describe_pose(groups[group])}"
-        for side in ("left", "right"):
-            if f"{side} cell" in groups:
-                cell = _describe_cell(groups[f"{side} cell"])
-                return f"{prefix}show the board {cell} the {side} image"
-        return prefix + "show the board in another pose"
+        first = next(
+            groups[name]
+            for name in ("tilt", "distance", "left cell", "right cell", "pairs")
+            if name in groups
+        )
+        return f"{prefix}show the board {describe_requirement(first)}"
 
 
-def _describe_pose(one: Bin) -> str:
-    phrases = {"upright": "facing the camera", "near": "nearer", "far": "further away"}
-    if one.name == "middle":
-        return "at middle distance"
-    return phrases.get(one.name, f"with its {one.name.replace(' back', ' tilted back')}")
+POSES = {
+    "upright": "facing the camera",
+    "near": "nearer",
+    "middle": "at middle distance",
+    "far": "further away",
+    "": "in another pose",
+}
 
 
-def _describe_cell(cell: Bin) -> str:
-    """Return the position of a cell in words, such as "at the top left of"."""
-    column, row = (int(part) for part in cell.name.split(","))
+def describe_requirement(one: Bin) -> str:
+    """Return a required pose of the board in words, such as "at the top left of the left image"."""
+    if not one.group.endswith("cell"):
+        return POSES.get(one.name, f"with its {one.name.replace(' back', ' tilted back')}")
+    column, row = (int(part) for part in one.name.split(","))
     height = ("top", "middle", "bottom")[row]
     across = ("left", "centre left", "centre right", "right")[column]
-    return f"at the {height} {across} of"
+    return f"at the {height} {across} of the {one.group.removesuffix(' cell')} image"
 
 
 def classify_tilt(pose: Floats, middle: Floats) -> str:
@@ -222,17 +229,3 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
     if abs(aside[0]) > abs(aside[1]):
         return "left side back" if aside[0] < 0 else "right side back"
     return "top back" if aside[1] < 0 else "bottom back"
-
-
-def _measure_shift(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median displacement (px) of the corners that two left images have in common.
-
-    The result is infinite if the images have no corners in common.
-    """
-    _, here, there = np.intersect1d(
-        pair.left.ids, other.left.ids, assume_unique=True, return_indices=True
-    )
-    if not len(here):
-        return float("inf")
-    shifts = pair.left.pixels[here] - other.left.pixels[there]
-    return float(np.median(np.linalg.norm(shifts, axis=1)))

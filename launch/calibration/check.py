@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.bundle import (
     LEFT,
@@ -37,9 +36,8 @@ from flexsheet.launch.calibration.corners import (
 )
 from flexsheet.launch.calibration.selection import MIN_PAIRS, PairSelection, fit_selection
 from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.camera import camera_matrix
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,9 +165,8 @@ def _rms(values: Floats) -> float | None:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
-def _in_mm(values: Floats) -> float | None:
-    rms = _rms(values)
-    return None if rms is None else 1e3 * rms
+def _rms_mm(values_m: Floats) -> float | None:
+    return _rms(1e3 * values_m)
 
 
 def summarize(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | None]:
@@ -182,9 +179,9 @@ def summarize(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | Non
     """
     return {
         "pairs": len(boards),
-        "square_rms_mm": _in_mm(np.concatenate([one.squares_m for one in boards])),
-        "diagonal_rms_mm": _in_mm(np.concatenate([one.diagonals_m for one in boards])),
-        "rigid_fit_rms_mm": _in_mm(np.concatenate([one.rigid_fit_m for one in boards])),
+        "square_rms_mm": _rms_mm(np.concatenate([one.squares_m for one in boards])),
+        "diagonal_rms_mm": _rms_mm(np.concatenate([one.diagonals_m for one in boards])),
+        "rigid_fit_rms_mm": _rms_mm(np.concatenate([one.rigid_fit_m for one in boards])),
         "reprojection_rms_px": _rms(np.concatenate([one.reprojection_px for one in boards])),
         "distance_m": float(np.median([one.distance_m for one in boards])),
     }
@@ -346,9 +343,9 @@ def cross_check(
             {
                 "left": left_paths[i].name,
                 "distance_m": measured[i].distance_m,
-                "rigid_fit_rms_mm": _in_mm(measured[i].rigid_fit_m),
+                "rigid_fit_rms_mm": _rms_mm(measured[i].rigid_fit_m),
                 "plain_rigid_fit_rms_mm": (
-                    _in_mm(plain_measured[i].rigid_fit_m) if i in plain_measured else None
+                    _rms_mm(plain_measured[i].rigid_fit_m) if i in plain_measured else None
                 ),
             }
             for i in numbers

@@ -67,6 +67,22 @@ class StepName(StrEnum):
 
 STEPS = tuple(StepName)
 
+SIMULATED_STEP_S: Mapping[StepName, float] = {
+    StepName.CAMERA: 6.0,
+    StepName.ARMS: 3.6,
+    StepName.EDGES: 1.1,
+    StepName.SHEET: 3.2,
+    StepName.PROJECTOR: 7.1,
+    StepName.MARKER: 2.6,
+    StepName.EYES: 0.5,
+    StepName.DELAYS: 7.5,
+}
+"""The median durations (s) of the steps in 30 simulated laboratories on two processor cores.
+
+Source: docs/results/robustness-commissioned-modern.json. The duration of a verification in a
+running graph was not measured there.
+"""
+
 
 class NodeValue(LimitedModel):
     """A measured value of a node parameter.
@@ -102,7 +118,7 @@ class StepResult(LimitedModel):
     node_values: measured values of other node parameters.
     missing: quantities that were not measured.
     figures: further results.
-    covariances: covariance matrices by name, from which errors are predicted.
+    covariances: covariance matrices by name, for the prediction of errors.
     """
 
     residual: float
@@ -169,7 +185,7 @@ Step = Callable[["Commissioning"], StepResult]
 
 @dataclass(slots=True)
 class Commissioning:
-    """A sequence of all calibrations of one laboratory, whose state is stored in a folder.
+    """A sequence of all calibrations of one laboratory, with its state in a folder.
 
     If the folder contains a state, the sequence continues from this state.
 
@@ -230,11 +246,11 @@ class Commissioning:
 
     def find_file(self, name: str) -> Path | None:
         """Return the path of a calibration file, or None if no finished step has written it."""
-        used = [value for one in self._results(STEPS) for value in one.parameters.values()]
+        used = [value for one in self._results() for value in one.parameters.values()]
         return self.folder / name if name in used else None
 
-    def _results(self, steps: tuple[StepName, ...]) -> Iterator[StepResult]:
-        for name in steps:
+    def _results(self) -> Iterator[StepResult]:
+        for name in STEPS:
             record = self.state.steps.get(name)
             if record is not None and record.result is not None:
                 yield record.result
@@ -242,6 +258,17 @@ class Commissioning:
     def pending(self) -> list[StepName]:
         """Return the names of the steps that are neither finished nor skipped."""
         return [name for name in STEPS if name not in self.state.steps]
+
+    def expected_s(self, name: StepName) -> float | None:
+        """Return the expected duration (s) of a step, or None if it is unknown.
+
+        A repeated step is expected to take as long as its last run. A first run in a simulated
+        laboratory is expected to take as long as in earlier measurements.
+        """
+        record = self.state.steps.get(name)
+        if record is not None and record.result is not None:
+            return record.seconds
+        return None if self.apparatus is None else SIMULATED_STEP_S.get(name)
 
     def skip(self, name: StepName, reason: str) -> None:
         """Mark a step as skipped, and discard the results of all later steps."""
@@ -284,7 +311,7 @@ class Commissioning:
 
     def _write_scene(self) -> None:
         values: dict[str, Any] = {}
-        for result in self._results(STEPS):
+        for result in self._results():
             values |= result.scene_values
         with edit_yaml(self.scene_file, self.scene_copy) as tree:
             for path, value in values.items():
@@ -299,7 +326,7 @@ class Commissioning:
         graph = load_graph(self.launch_file)
         measured: dict[str, str] = {}
         values: list[NodeValue] = []
-        for result in self._results(STEPS):
+        for result in self._results():
             measured |= result.parameters
             values += result.node_values
         with edit_yaml(self.launch_file, self.launch_copy) as tree:
@@ -323,7 +350,7 @@ class Commissioning:
 
 
 def _make_yaml(value: Any) -> Any:
-    """Convert a value for a YAML document, so that a list is written on one line."""
+    """Convert a value for a YAML document, with each list on one line."""
     if not isinstance(value, list):
         return value
     row = CommentedSeq([_make_yaml(one) for one in value])

@@ -13,14 +13,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats, Image, Ints
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
 """A function that is called to report progress.
 
@@ -76,7 +73,7 @@ class CalibrationError(FlexsheetError, ValueError):
 class BoardView:
     """The board corners in one image, as ascending ids (n,) and pixel positions (n, 2)."""
 
-    ids: Ids
+    ids: Ints
     pixels: Floats
 
 
@@ -90,7 +87,7 @@ class BoardPair:
     left: BoardView
     right: BoardView
 
-    def common(self) -> tuple[Ids, Floats, Floats]:
+    def common(self) -> tuple[Ints, Floats, Floats]:
         """Return the corners that both images show.
 
         The result contains the ids (n,) and the pixel positions (n, 2) in the left and right image.
@@ -99,6 +96,17 @@ class BoardPair:
             self.left.ids, self.right.ids, assume_unique=True, return_indices=True
         )
         return ids, self.left.pixels[in_left], self.right.pixels[in_right]
+
+
+def measure_shift_px(view: BoardView, other: BoardView) -> float:
+    """Return the median displacement (px) of the corners that two images have in common.
+
+    The result is infinite if the images have no corners in common.
+    """
+    _, here, there = np.intersect1d(view.ids, other.ids, assume_unique=True, return_indices=True)
+    if not len(here):
+        return float("inf")
+    return float(np.median(np.linalg.norm(view.pixels[here] - other.pixels[there], axis=1)))
 
 
 def ignore_progress(done: int, total: int, what: str) -> None:
@@ -162,7 +170,7 @@ def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
 class CornerFinder:
     """A detector of the corners of one calibration board.
 
-    quick: whether to use OpenCV's fast check, which quickly rejects images without a board.
+    quick: whether to reject images without a board by OpenCV's fast check.
     """
 
     def __init__(self, board: Board, *, quick: bool = False) -> None:
@@ -264,7 +272,7 @@ def _refine_corners(
 
 
 def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
-    """Renumber the corners (n, 2) of the right image, so that they match those of the left image.
+    """Renumber the corners (n, 2) of the right image to match the left image.
 
     A detector may start at either end of the board, or at any corner of a square board. Because the
     cameras of a stereo rig are nearly parallel, the matching numbering has the same directions in

@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
+from flexsheet.messages.types import Side
+
+SIDES: tuple[Side, Side] = ("left", "right")
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
@@ -21,8 +24,8 @@ def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, s
             rows = [(f"{path}:{reader.line_num}", row) for row in reader]
             found = tuple(reader.fieldnames or ())
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
+        raise BadInputError.single(
+            str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8"
         ) from error
     missing = list_missing(str(path), found, columns)
     if missing:
@@ -50,8 +53,8 @@ def read_table(
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
+        raise BadInputError.single(
+            str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8"
         ) from error
     lines = [
         (number, [cell.strip() for cell in next(csv.reader([line]))])
@@ -60,7 +63,7 @@ def read_table(
     ]
     if not lines:
         remedy = f"start with a line of columns: {', '.join(columns)}"
-        raise BadInputError([Problem(str(path), (), "is empty", remedy)])
+        raise BadInputError.single(str(path), (), "is empty", remedy)
     (first, names), *rows = lines
     where = f"{path}:{first}"
     wrong = [
@@ -92,6 +95,19 @@ def list_missing(where: str, names: Sequence[str], wanted: Sequence[str]) -> lis
     return [
         Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
     ]
+
+
+def parse_side(where: str, name: str, text: str, problems: list[Problem]) -> Side:
+    """Convert the text in the column `name` to a side.
+
+    If the text is neither "left" nor "right", append a problem to `problems` and return "left".
+    """
+    for side in SIDES:
+        if text.strip() == side:
+            return side
+    what = f'expected left or right, found "{text}"'
+    problems.append(Problem(where, (name,), what, "write left or right"))
+    return SIDES[0]
 
 
 def parse_finite(where: str, name: str, text: str, problems: list[Problem]) -> float:

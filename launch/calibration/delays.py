@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from flexsheet.launch.calibration.csv_rows import SIDES
 from flexsheet.launch.calibration.edge_marks import MarkDetector
 from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.launch.experiments.simulated_time import (
@@ -48,7 +49,6 @@ from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import apply_apparatus
 
-SIDES: tuple[Side, Side] = ("left", "right")
 STROKE_S = 5.0
 """The duration (s) of the simulated stroke of the finger."""
 

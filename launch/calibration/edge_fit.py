@@ -21,23 +21,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from flexsheet.launch.calibration.csv_rows import SIDES
+from flexsheet.launch.calibration.hand_eye import apply_motion
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import ArmSpec, Pose, Scene, SheetSpec
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import make_kinematics
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import (
     apply,
     pose_matrix,
-    rotation_from_vector,
     rpy_from_rotation,
-    transform,
 )
 from flexsheet.nodes.models.sheet import edge_force_n
-
-Floats = NDArray[np.float64]
 
 BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
 """The indices of the unknowns: base pose error, joint offsets, edge pose error, compliance."""
@@ -140,11 +138,10 @@ def fit_edges(poses: Sequence[HeldPose], scene: Scene) -> dict[Side, EdgeFit]:
 
     Raises EdgeFitError if there are too few poses, or if the marks contradict each other.
     """
-    sides: tuple[tuple[Side, ArmSpec], ...] = (
-        ("left", scene.arms.left),
-        ("right", scene.arms.right),
-    )
-    return {side: _fit_arm(_make_rows(poses, side, scene.sheet), arm) for side, arm in sides}
+    return {
+        side: _fit_arm(_make_rows(poses, side, scene.sheet), getattr(scene.arms, side))
+        for side in SIDES
+    }
 
 
 def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[_Row]:
@@ -191,7 +188,7 @@ class _ArmModel:
 
     def transforms(self, unknowns: Floats) -> tuple[Floats, Floats]:
         """Return world_from_base (4, 4) and flange_from_edge (4, 4) for given unknowns (19,)."""
-        return _shift(self._base, unknowns[BASE]), _shift(self._clamp, unknowns[EDGE])
+        return apply_motion(self._base, unknowns[BASE]), apply_motion(self._clamp, unknowns[EDGE])
 
     def positions(self, unknowns: Floats) -> Floats:
         """Return the positions (n, 3), in m, of the marks in the world for given unknowns (19,)."""
@@ -268,8 +265,3 @@ def _pose(matrix: Floats) -> Pose:
     return Pose(
         position_m=np.ascontiguousarray(matrix[:3, 3]), rpy_rad=rpy_from_rotation(matrix[:3, :3])
     )
-
-
-def _shift(pose: Floats, error: Floats) -> Floats:
-    """Rotate a pose (4, 4) about its own origin by error[:3], and translate it by error[3:]."""
-    return transform(rotation_from_vector(error[:3]) @ pose[:3, :3], pose[:3, 3] + error[3:])

@@ -12,10 +12,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.arm_poses import MAX_STILL_RAD, MIN_STILL_S
-from flexsheet.launch.calibration.csv_rows import parse_finite, read_rows
+from flexsheet.launch.calibration.csv_rows import SIDES, parse_finite, parse_side, read_rows
 from flexsheet.launch.calibration.edge_fit import EdgeMark, HeldPose
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.documents import BadInputError, Problem
@@ -24,6 +23,7 @@ from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
@@ -34,10 +34,6 @@ from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import apply_apparatus
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
-
-SIDES: tuple[Side, Side] = ("left", "right")
 JOINT_COLUMNS = tuple(f"{side}_j{number}_deg" for side in SIDES for number in range(1, 7))
 COLUMNS = ("pose", "side", "along_mm", "x_mm", "y_mm", "z_mm", *JOINT_COLUMNS)
 """The columns of the CSV file of marks, which has one row for each mark in each pose.
@@ -72,32 +68,22 @@ MIN_NEW_JOINT_RAD = 0.02
 def read_edge_marks(path: Path) -> list[HeldPose]:
     """Read the measured marks from a CSV file with the columns `COLUMNS`.
 
-    Raises BadInputError, which names file, line, column and value, and states the remedy.
+    Raises BadInputError for an invalid file.
     """
     problems: list[Problem] = []
     joints: dict[str, tuple[Floats, Floats]] = {}
     marks: dict[str, list[EdgeMark]] = defaultdict(list)
     for where, row in read_rows(path, COLUMNS):
-        values = {}
-        for name in COLUMNS[2:]:
-            values[name] = parse_finite(where, name, row[name], problems)
-        named = (row["side"] or "").strip()
-        side = next((one for one in SIDES if one == named), None)
-        if side is None:
-            what = f'expected left or right, found "{named}"'
-            problems.append(Problem(where, ("side",), what, "name the arm that holds the clamp"))
-            continue
+        values = {name: parse_finite(where, name, row[name], problems) for name in COLUMNS[2:]}
+        side = parse_side(where, "side", row["side"], problems)
         left, right = np.radians([values[name] for name in JOINT_COLUMNS]).reshape(2, 6)
         joints[row["pose"]] = left, right
-        marks[row["pose"]].append(_make_mark(side, values))
+        mark_edge_m = 1e-3 * np.array([0.0, values["along_mm"], 0.0])
+        position_m = 1e-3 * np.array([values["x_mm"], values["y_mm"], values["z_mm"]])
+        marks[row["pose"]].append(EdgeMark(side, mark_edge_m, position_m))
     if problems:
         raise BadInputError(problems[:MAX_PROBLEMS])
     return [HeldPose(*joints[pose], tuple(marks[pose])) for pose in joints]
-
-
-def _make_mark(side: Side, values: dict[str, float]) -> EdgeMark:
-    position = 1e-3 * np.array([values["x_mm"], values["y_mm"], values["z_mm"]])
-    return EdgeMark(side, np.array([0.0, 1e-3 * values["along_mm"], 0.0]), position)
 
 
 def make_detector_config() -> DetectorConfig:
@@ -116,7 +102,7 @@ def make_detector_config() -> DetectorConfig:
 
 
 class MarkDetector:
-    """A detector of marks in stereo images, which uses the methods of the triangulator."""
+    """A detector of marks in stereo images."""
 
     def __init__(self, scene: Scene, calibration: StereoCalibration | None) -> None:
         self._geometry = StereoGeometry.of(scene.camera, calibration)
@@ -216,7 +202,6 @@ def simulate_edge_marks(
     *,
     calibration: StereoCalibration | None,
     seed: int,
-    poses: int = SIMULATED_POSES,
 ) -> list[HeldPose]:
     """Simulate how the stereo camera measures marks on the clamps of the sheet.
 
@@ -225,7 +210,6 @@ def simulate_edge_marks(
 
     apparatus: true parameters of the simulated hardware.
     calibration: camera parameters that the detector uses; None: the scene's parameters.
-    poses: number of poses.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)
@@ -236,15 +220,18 @@ def simulate_edge_marks(
     )
     found: list[HeldPose] = []
     for _ in range(MAX_TRIES):
-        if len(found) == poses:
+        if len(found) == SIMULATED_POSES:
             break
         edges = _draw_edges(scene, random)
         try:
             joints = arms.solve_joints(edges)
         except ValueError:
             continue  # The pose is out of reach: try another random one.
-        play = tuple(_draw_play(apparatus, side, random) for side in ("left", "right"))
-        true_edges = arms.hold(edges, play_rad=(play[0], play[1]))
+        left, right = (
+            0.5 * (arm.backlash_rad or 0.0) * random.uniform(-1.0, 1.0, 6)
+            for arm in (apparatus.arms.left, apparatus.arms.right)
+        )
+        true_edges = arms.hold(edges, play_rad=(left, right))
         marks = _see_marks(scene, camera, detector, edges, true_edges)
         found.append(HeldPose(*joints, tuple(marks)))
     return found
@@ -258,12 +245,8 @@ def _draw_edges(scene: Scene, random: np.random.Generator) -> tuple[Floats, Floa
     return place_edges(transform(rotation, random.uniform(CENTRE_MIN_M, CENTRE_MAX_M)), length_m)
 
 
-def _draw_play(apparatus: Apparatus, side: Side, random: np.random.Generator) -> Floats:
-    truth = apparatus.arms.left if side == "left" else apparatus.arms.right
-    return 0.5 * (truth.backlash_rad or 0.0) * random.uniform(-1.0, 1.0, 6)
-
-
-def _rest(position: Floats, _time_s: float) -> Floats:
+def rest(position: Floats, _time_s: float) -> Floats:
+    """Return a constant position (3,), as the motion of a mark at rest."""
     return position
 
 
@@ -283,7 +266,7 @@ def _see_marks(
         for fraction in ALONG:
             mark = np.array([0.0, fraction * scene.sheet.height_m, 0.0])
             images = camera.picture(
-                partial(_rest, apply(true, mark)), exposure_s=scene.camera.exposure_s
+                partial(rest, apply(true, mark)), exposure_s=scene.camera.exposure_s
             )
             found = detector.find(*images, near_world_m=apply(expected, mark))
             if found is not None:

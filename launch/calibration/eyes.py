@@ -17,11 +17,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from flexsheet.launch.calibration.csv_rows import parse_finite, read_rows
-from flexsheet.launch.calibration.edge_marks import MarkDetector
+from flexsheet.launch.calibration.csv_rows import SIDES, parse_finite, parse_side, read_rows
+from flexsheet.launch.calibration.edge_marks import MarkDetector, rest
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
@@ -29,6 +28,7 @@ from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Eyes, Scene
 from flexsheet.messages.types import Side
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
@@ -36,9 +36,6 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 from flexsheet.nodes.twin.viewer import HeadSway, Viewer
 
-Floats = NDArray[np.float64]
-
-SIDES: tuple[Side, Side] = ("left", "right")
 POINTS = ("bead", "cross")
 COLUMNS = ("eye", *(f"{point}_{axis}_mm" for point in POINTS for axis in "xyz"))
 """The columns of the CSV file of alignments, which has one row for each alignment.
@@ -205,25 +202,17 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
 def read_alignments(path: Path) -> list[Alignment]:
     """Read alignments from a CSV file with the columns `COLUMNS`.
 
-    Raises BadInputError, which names file, line, column and value, and states the remedy.
+    Raises BadInputError for an invalid file.
     """
     problems: list[Problem] = []
     found = []
     for where, row in read_rows(path, COLUMNS):
-        side = next((one for one in SIDES if one == (row["eye"] or "").strip()), None)
-        if side is None:
-            what = f'expected left or right, found "{row["eye"]}"'
-            problems.append(Problem(where, ("eye",), what, "name the open eye"))
-            continue
+        side = parse_side(where, "eye", row["eye"], problems)
         values = [parse_finite(where, name, row[name], problems) for name in COLUMNS[1:]]
         found.append(Alignment(side, 1e-3 * np.array(values[:3]), 1e-3 * np.array(values[3:])))
     if problems:
         raise BadInputError(problems)
     return found
-
-
-def _rest(position: Floats, _time_s: float) -> Floats:
-    return position
 
 
 def simulate_alignments(
@@ -257,7 +246,7 @@ def simulate_alignments(
         if cross is None:
             continue
         images = camera.picture(
-            partial(_rest, bead), exposure_s=scene.camera.exposure_s, lit_points=cross[None]
+            partial(rest, bead), exposure_s=scene.camera.exposure_s, lit_points=cross[None]
         )
         seen = [detector.find(*images, near_world_m=point) for point in (bead, cross)]
         if seen[0] is not None and seen[1] is not None:

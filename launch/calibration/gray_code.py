@@ -13,13 +13,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Image = NDArray[np.uint8]
+from flexsheet.nodes.arrays import Bools, Floats, Image
 
 MIN_CONTRAST = 24
 """The minimum difference in grey levels between white and black at a lit camera pixel."""

@@ -24,12 +24,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import RV_1A, ClosedFormArm, JointChain
 from flexsheet.nodes.arm_bridge.geometry import make_kinematics
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.camera import project
 from flexsheet.nodes.models.rigid import (
     apply,
@@ -39,8 +39,6 @@ from flexsheet.nodes.models.rigid import (
     transform,
     vector_from_rotation,
 )
-
-Floats = NDArray[np.float64]
 
 MIN_POSES = 6
 """The minimum number of poses for a calibration. From 15 to 20 poses are recommended."""
@@ -238,8 +236,8 @@ class _Unknowns:
         step: motion (6,) of the base, then motion (6,) of the board.
         """
         return _Unknowns(
-            _apply_motion(self.world_from_base, step[:6]),
-            _apply_motion(self.flange_from_board, step[6:]),
+            apply_motion(self.world_from_base, step[:6]),
+            apply_motion(self.flange_from_board, step[6:]),
         )
 
 
@@ -316,7 +314,7 @@ def _check_count(detections: Sequence[BoardDetection]) -> None:
             )
 
 
-def _check_outliers(detections: Sequence[BoardDetection], used: NDArray[np.bool_]) -> None:
+def _check_outliers(detections: Sequence[BoardDetection], used: Bools) -> None:
     outliers = int((~used).sum())
     if outliers > MAX_OUTLIER_RATIO * len(used):
         names = ", ".join(one.name for one, good in zip(detections, used, strict=True) if not good)
@@ -520,8 +518,8 @@ def _compute_discrepancies(
     return np.array(found)
 
 
-def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the poses with which the first fit is made.
+def _find_rough_inliers(discrepancies: Floats) -> Bools:
+    """Return a mask (n,) of the poses for the first fit.
 
     Poses with errors above a multiple of the median are excluded.
 
@@ -552,7 +550,7 @@ class _NoiseModel:
         return np.asarray(np.linalg.inv(self.corner_px**2 * spreads + arm))
 
 
-def _find_inliers(poses: Sequence[_LinearizedPose], model: _NoiseModel) -> NDArray[np.bool_]:
+def _find_inliers(poses: Sequence[_LinearizedPose], model: _NoiseModel) -> Bools:
     """Return a mask (n,) of the poses that are not outliers.
 
     The mask is the result of a chi-square test of deviations that are scaled by their median. A
@@ -689,7 +687,7 @@ def _estimate_deviations(
     )
 
 
-def _apply_motion(pose: Floats, motion: Floats) -> Floats:
+def apply_motion(pose: Floats, motion: Floats) -> Floats:
     """Rotate a pose (4, 4) about its own origin, and translate it.
 
     Both parts of the motion (6,) are in the axes of the parent frame.
@@ -705,7 +703,7 @@ def _make_result(
     *,
     unknowns: _Unknowns,
     model: _NoiseModel,
-    used: NDArray[np.bool_],
+    used: Bools,
 ) -> BaseFit:
     every = _linearize(unknowns, detections, flanges, rig)
     poses = [one for one, good in zip(every, used, strict=True) if good]

@@ -17,12 +17,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from flexsheet.messages.errors import FlexsheetError
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M = 2e-4, 1e-4, 1e-4
 """The expected standard deviations (m) per axis of three kinds of errors.

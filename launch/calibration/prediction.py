@@ -14,7 +14,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import brentq
 
@@ -33,13 +32,13 @@ from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, vector_from_rotation
 from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.rig import make_true_camera
 
-Floats = NDArray[np.float64]
 Random = np.random.Generator
 
 DRAWS = 12
@@ -115,7 +114,7 @@ class PredictedError(LimitedModel):
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """The results of calibrations from which errors are predicted.
+    """The results of calibrations, for the prediction of errors.
 
     calibrations: calibrations that the nodes use.
     edges: covariance (19, 19) of the unknowns of `fit_edges`, by side. A side without calibration
@@ -135,16 +134,13 @@ class Knowledge:
     sheet_mass_std_ratio: float = SHEET_MASS_STD_RATIO
 
 
-def predict_errors(
-    known: Knowledge, tracking_m: float, *, draws: int = DRAWS
-) -> dict[Metric, PredictedError]:
+def predict_errors(known: Knowledge, tracking_m: float) -> dict[Metric, PredictedError]:
     """Predict the errors of sheet and fingertip during a stroke, and of image and force at rest.
 
     The finger moves at the working speed of the scene.
 
     tracking_m: mean tracking error of the sheet that the devices report during a stroke. It is
         independent of the calibration errors, so it is added to them in quadrature.
-    draws: number of random samples.
     """
     random = np.random.default_rng(DRAW_SEED)
     scene = known.scene
@@ -161,7 +157,7 @@ def predict_errors(
     metrics = ALL_METRICS if scene.projector is not None else ALL_METRICS - {Metric.IMAGE}
     drawn = [
         evaluator.evaluate(draw_apparatus(known, random), metrics, speed_m_per_s).figures()
-        for _ in range(draws)
+        for _ in range(DRAWS)
     ]
     tolerances = metric_tolerances(scene)
     predicted = {}

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from flexsheet.launch.calibration.corners import CalibrationError, describe, make_charuco_board
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.files import write_file
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Bools, Floats
 
 BORDER_SQUARES = 1.0
 """The width of the white border around the board, in squares. Detectors need this border."""
@@ -57,7 +56,7 @@ def find_black_rectangles(board: Board) -> Floats:
     return np.array(squares)
 
 
-def _find_runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
+def _find_runs(black: Bools) -> list[tuple[int, int, int]]:
     """Return each horizontal run of black cells in a marker image as (row, first column, length).
 
     black: marker image (rows, columns); true for black cells.
@@ -70,7 +69,7 @@ def _find_runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
 
 
 def make_caption(board: Board) -> str:
-    """Return the text below the board, which describes the board and the print scale."""
+    """Return the text below the board. The text describes the board and the print scale."""
     text = f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"
     if board.marker_m is not None:
         text += f", markers of {1e3 * board.marker_m:g} mm, {board.dictionary}"

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from flexsheet.launch.calibration.gray_code import DecodeError, Image, decode_patterns, find_pixels
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, Pose, Projector, StereoCamera
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.camera import camera_matrix, normalize, project
 from flexsheet.nodes.models.rigid import (
     apply,
@@ -28,7 +29,6 @@ from flexsheet.nodes.models.rigid import (
     vector_from_rotation,
 )
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
@@ -63,13 +63,11 @@ class ProjectorPoints:
     world: positions (n, 3) in the world, m.
     pixels: projector pixels (n, 2).
     pose: index (n,) of the sheet's pose.
-    skew_m: distance (n,) between the rays of the two cameras.
     """
 
     world: Floats
     pixels: Floats
     pose: Indices
-    skew_m: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +103,14 @@ def measure_points(
 
     poses: images of the Gray-code patterns from the left and from the right camera, for each pose.
     camera: stereo camera with calibrated optics and with `world_from_left` from the scene.
-    projector: projector, of which only the image size is used.
+    projector: projector; only its image size is used.
 
     Raises ProjectorError if the patterns cannot be decoded.
     """
     size = projector.width_px, projector.height_px
     columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
     grid_pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    parts: list[tuple[Floats, Floats, Indices, Floats]] = []
+    parts: list[tuple[Floats, Floats, Indices]] = []
     for number, views in enumerate(poses):
         found = []
         for side, images in zip(("left", "right"), views, strict=True):
@@ -121,17 +119,15 @@ def measure_points(
             except DecodeError as error:
                 raise ProjectorError(f"pose {number + 1}, {side} camera: {error}") from error
         both = found[0][1] & found[1][1]
-        world, skew_m = triangulate_points(found[0][0][both], found[1][0][both], camera)
-        parts.append((world, grid_pixels[both], np.full(int(both.sum()), number), skew_m))
-    world, pixels, pose, skew = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return ProjectorPoints(world, pixels, pose, skew)
+        world = triangulate_points(found[0][0][both], found[1][0][both], camera)
+        parts.append((world, grid_pixels[both], np.full(int(both.sum()), number)))
+    return ProjectorPoints(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
+def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> Floats:
     """Triangulate pixels (n, 2) of the left and the right image.
 
-    Return world points (n, 3) midway between the two rays, and the distances (n,) between the rays,
-    m.
+    Return the world points (n, 3), in m, midway between the rays of the two cameras.
     """
     from_right = inverse(camera.right_from_left)
     slopes = [
@@ -150,9 +146,7 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tup
     denominator = aa * bb - ab * ab
     on_a = ((bb * da - ab * db) / denominator)[:, None] * a
     on_b = base + ((ab * da - aa * db) / denominator)[:, None] * b
-    pose = camera.world_from_left
-    world_from_left = pose_matrix(pose)
-    return apply(world_from_left, 0.5 * (on_a + on_b)), np.linalg.norm(on_a - on_b, axis=1)
+    return apply(pose_matrix(camera.world_from_left), 0.5 * (on_a + on_b))
 
 
 def project_points(projector: Projector, world: Floats) -> Floats:
@@ -166,7 +160,7 @@ def project_points(projector: Projector, world: Floats) -> Floats:
 def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
     """Fit the optics and the pose of a projector to the points that its pixels light.
 
-    guess: projector with which the fit starts.
+    guess: initial projector of the fit.
 
     Raises ProjectorError for too few points or poses, a small depth range or coverage, and large
     residuals.
@@ -250,13 +244,11 @@ def _measure_coverage(pixels: Floats, projector: Projector) -> float:
     return len(np.unique(cells, axis=0)) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
 
 
-def _fit_projector(
-    points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projector
-) -> Projector:
+def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) -> Projector:
     """Fit the pose, one focal length, the principal point, k1, k2, p1 and p2 by least squares.
 
-    The aspect ratio and k3 are fixed to the values of `guess`. OpenCV's fit is not used, because it
-    rejects a principal point outside the image, which is typical of a projector with lens shift.
+    The aspect ratio and k3 are fixed to the values of `guess`. A projector with lens shift has a
+    principal point outside the image. OpenCV's fit rejects such a point, and is therefore not used.
 
     inliers: mask (n,) of the points to use.
     """

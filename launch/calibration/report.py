@@ -14,20 +14,19 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.bundle import PARAMETERS, pose_transform
 from flexsheet.launch.calibration.check import StereoRig
 from flexsheet.launch.calibration.corners import board_points, describe
 from flexsheet.launch.calibration.stereo import CalibrationResult
 from flexsheet.messages.files import write_file
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import rigid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0

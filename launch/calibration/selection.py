@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.bundle import (
     NotDeterminedError,
@@ -22,10 +21,14 @@ from flexsheet.launch.calibration.bundle import (
     pose_transform,
     pose_vector,
 )
-from flexsheet.launch.calibration.corners import BoardPair, BoardView, CalibrationError
+from flexsheet.launch.calibration.corners import (
+    BoardPair,
+    BoardView,
+    CalibrationError,
+    measure_shift_px,
+)
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import rigid
-
-Floats = NDArray[np.float64]
 
 MIN_PAIRS = 5
 OUTLIER_RATIO = 3.0
@@ -133,7 +136,7 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
 
 
 def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
-    """Find the pairs whose board pose repeats that of an earlier pair.
+    """Find the pairs that repeat the board pose of an earlier pair.
 
     Return a mapping from the index of the repeated pair to the index of the earlier pair. Repeated
     pairs have the same errors, so they must not count as independent measurements.
@@ -145,28 +148,18 @@ def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
     for number, pair in enumerate(found):
         if isinstance(pair, str):
             continue
-        near = (i for i, other in unique.items() if _measure_distance(pair, other) < REPEAT_PX)
+        near = (
+            i
+            for i, other in unique.items()
+            if measure_shift_px(pair.left, other.left) < REPEAT_PX
+            and measure_shift_px(pair.right, other.right) < REPEAT_PX
+        )
         before = next(near, None)
         if before is None:
             unique[number] = pair
         else:
             repeated[number] = before
     return repeated
-
-
-def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median distance (px) between the corners that two pairs have in common.
-
-    The result is the larger of the medians of the left and of the right images. It is infinite if
-    there are no common corners.
-    """
-    medians = []
-    for here, there in ((pair.left, other.left), (pair.right, other.right)):
-        _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
-        if not len(a):
-            return float("inf")
-        medians.append(np.median(np.linalg.norm(here.pixels[a] - there.pixels[b], axis=1)))
-    return float(max(medians))
 
 
 class PairSelection:
@@ -217,7 +210,7 @@ class PairSelection:
         return bool(bad)
 
     def replace_pairs(self, cleaned: Sequence[BoardPair]) -> None:
-        """Replace the used pairs by pairs from which outlier corners have been removed.
+        """Replace the used pairs by pairs without outlier corners.
 
         Pairs that have lost too many corners are excluded.
         """

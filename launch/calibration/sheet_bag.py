@@ -8,16 +8,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.sheet_fit import MeasuredPush, SheetModelFitError
+from flexsheet.launch.calibration.simulated_sheet import flat_axes
 from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, Fingertip, Force
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
-
-Floats = NDArray[np.float64]
 
 QUIET_S, QUIET_M = 0.15, 0.0005
 """The time (s) before and after a measured force, and the maximum change of depth (m) in this time.
@@ -161,11 +160,7 @@ def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[floa
     tip: position (3,) of the fingertip.
     left, right: poses (4, 4) of the clamped edges.
     """
-    across = right[:3, 3] - left[:3, 3]
-    distance_m = float(np.linalg.norm(across))
-    x_axis = across / distance_m
-    normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
-    normal /= np.linalg.norm(normal)
-    offset = tip - 0.5 * (left[:3, 3] + right[:3, 3])
-    y_m = float(offset @ np.cross(normal, x_axis))
-    return -float(offset @ normal), (float(offset @ x_axis), y_m), distance_m
+    x_axis, y_axis, normal, centre = flat_axes(left, right)
+    offset = tip - centre
+    distance_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
+    return -float(offset @ normal), (float(offset @ x_axis), float(offset @ y_axis)), distance_m

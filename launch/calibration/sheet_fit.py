@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.sheet.force_models import (
     ScaledSheetModel,
     SheetForceModel,
@@ -22,9 +22,6 @@ from flexsheet.nodes.models.sheet.force_models import (
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FORCE_NOISE_N = 0.01
 EDGE_NOISE_N = 0.1
@@ -157,7 +154,7 @@ def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> H
 
 
 def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) -> list[MeasuredPush]:
-    """Return the pushes with forces from which the effect of hysteresis has been removed."""
+    """Remove the effect of hysteresis from the forces of pushes."""
     signs = {None: 0.0, False: 1.0, True: -1.0}
     return [
         replace(push, force_n=push.force_n / (1.0 + signs[push.unloading] * hysteresis.amplitude))
@@ -189,10 +186,10 @@ def fit_sheet_model(
     of the force to that of ideal rubber. The weight of the Mooney term is optional. The
     least-squares fit is robust: it first uses a soft-L1 loss, and then omits outliers.
 
-    nominal: rubber with which the fit starts.
+    nominal: initial rubber of the fit.
     with_mooney: whether the weight of the Mooney term is fitted.
-    with_prior: whether nominal width and ideal rubber are used as prior values. This is needed if
-        all pushes have almost the same stretch, so that they do not determine the width.
+    with_prior: whether nominal width and ideal rubber are used as prior values. Pushes with almost
+    the same stretch do not determine the width, and need these prior values.
 
     Raises SheetModelFitError if there are too few pushes, or if they do not determine a parameter.
     """
@@ -292,7 +289,7 @@ def _predict(
 ) -> tuple[Floats, Floats]:
     """Compute the contact forces (n,) and the edge forces (n,), in N, of n pushes.
 
-    width_m: nominal width, to which stretch ratios refer.
+    width_m: nominal width of the sheet, the reference of stretch ratios.
     """
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
@@ -311,7 +308,7 @@ def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: fl
 
     The residual of an edge force that was not measured is NaN.
 
-    width_m: nominal width, to which stretch ratios refer.
+    width_m: nominal width of the sheet, the reference of stretch ratios.
     """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])

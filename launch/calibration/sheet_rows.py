@@ -44,7 +44,7 @@ def read_rows(
 
     finger_radius_m: radius for pushes without the column `finger_radius_mm`.
 
-    Raises BadInputError, which names file, line and column.
+    Raises BadInputError for an invalid file.
     """
     problems: list[Problem] = []
     pushes: list[MeasuredPush] = []
@@ -63,9 +63,7 @@ def read_rows(
             shown.append(Problem(str(path), (), f"and {len(problems) - MAX_PROBLEMS} more"))
         raise BadInputError(shown)
     if not pushes:
-        raise BadInputError(
-            [Problem(str(path), (), "does not contain rows", "add one line per push")]
-        )
+        raise BadInputError.single(str(path), (), "does not contain rows", "add one line per push")
     return pushes, numbers
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene, SheetSpec
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import METRES_PER_PX, seen
@@ -27,9 +27,6 @@ from flexsheet.nodes.twin.membrane import (
 )
 from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 JUST_TAUT_TENSION = 2e-6
 """The residual tension of slack rubber, divided by the shear modulus, for an almost taut sheet.
@@ -81,7 +78,7 @@ def _push(
     point_m: pushed point (x, y) from the centre of the flat sheet.
     cells: number of mesh intervals along each side of the sheet.
     """
-    x, y, normal, middle = _flat_axes(*edges)
+    x, y, normal, middle = flat_axes(*edges)
     distance_m = float((edges[1][:3, 3] - edges[0][:3, 3]) @ x)
     place = middle + point_m[0] * x + point_m[1] * y
     path = solve_path(
@@ -101,7 +98,7 @@ def _push(
     ]
 
 
-def _flat_axes(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def flat_axes(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the x axis, y axis, normal and centre, each (3,), of the flat sheet between two edges.
 
     left, right: poses (4, 4) of the clamped edges.
@@ -143,7 +140,7 @@ class SimulatedSheet:
         distance_m: commanded distance of the edges.
         depths_m: ascending depths.
         point_m: pushed point (x, y) from the sheet's centre.
-        radius_m: radius of the pushing ball, to which touched rubber sticks.
+        radius_m: radius of the pushing ball. Touched rubber sticks to the ball.
         """
         edges = self._arms.hold(place_edges(np.eye(4), distance_m))
         moving_in, moving_out = (float(ratio) for ratio in self._history_ratios)
@@ -158,10 +155,10 @@ class SimulatedSheet:
         """Simulate the sheet at a commanded pose (4, 4), without a push.
 
         Return the true pose (4, 4) of the flat sheet between the edges. Also return points (n, 3),
-        in m, of the true sheet, which sags under its weight.
+        in m, of the true sheet. The sheet sags under its weight.
         """
         left, right = self._arms.hold(place_edges(world_from_sheet, distance_m))
-        x, y, normal, middle = _flat_axes(left, right)
+        x, y, normal, middle = flat_axes(left, right)
         flat = transform(np.column_stack([x, y, normal]), middle)
         sheet = solve(self._rubber, left, right, cells=UNTOUCHED_CELLS)
         return flat, sheet.positions.reshape(-1, 3)

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.bundle import (
     LEFT,
@@ -46,8 +45,7 @@ from flexsheet.launch.calibration.uncertainty import (
 )
 from flexsheet.messages.calibration import Board, PairResidual, StereoCalibration, Uncertainty
 from flexsheet.messages.scene import Lens
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MAX_DEPTH_ERROR_FRACTION = 0.05
 """The maximum depth error of a valid calibration, as a fraction of the working distance."""

@@ -10,15 +10,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.csv_rows import list_missing, read_table
+from flexsheet.launch.calibration.csv_rows import list_missing, parse_finite, read_table
 from flexsheet.launch.calibration.edge_marks import make_detector_config
 from flexsheet.launch.calibration.marker_fit import Touch
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.triangulator.fingertip import detect_all
@@ -27,8 +27,6 @@ from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 REQUIRED = ("marker_x_mm", "marker_y_mm", "marker_z_mm",
             "point_x_mm", "point_y_mm", "point_z_mm", "tilt_x_deg", "tilt_y_deg")  # fmt: skip
@@ -44,7 +42,7 @@ MAX_LENGTH_MM = 5000.0
 def read_touches(path: Path, scene: Scene) -> list[Touch]:
     """Read touches from a CSV file. The document docs/set-up-marker.md lists the columns.
 
-    Raises BadInputError, which names file, line, column and value, and states the remedy.
+    Raises BadInputError for an invalid file.
     """
     problems: list[Problem] = []
     touches = []
@@ -75,15 +73,9 @@ def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) ->
     for name, text in cells.items():
         if not text and name in NORMAL:
             continue
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
+        value = parse_finite(where, name, text, problems)
         limit = {"deg": MAX_TILT_DEG, "mm": MAX_LENGTH_MM}.get(name.rpartition("_")[2], 1.0)
-        if not math.isfinite(value):
-            what = f'expected a finite number, found "{text}"'
-            problems.append(Problem(where, (name,), what, "measure this touch again, or remove it"))
-        elif abs(value) > limit:
+        if abs(value) > limit:
             what = f"expected a magnitude of at most {limit:g}, found {text}"
             problems.append(Problem(where, (name,), what, "check the unit"))
         values[name] = value
@@ -139,10 +131,10 @@ def simulate_touches(
     """Simulate touches of known points, as observed by the simulated stereo camera.
 
     First, the marker is measured in all orientations of `SIMULATED_TILTS_DEG`, relative to the
-    usual orientation of the finger. Then the finger touches each point in the orientations in which
-    the detector states the smallest uncertainty. The fit assumes that the usual orientation equals
-    `direction_world`, so the fitted offset is valid in use. A touch is omitted if the detector does
-    not accept the marker.
+    usual orientation of the finger. Then the finger touches each point in the orientations with the
+    smallest uncertainty. The fit assumes that the usual orientation equals `direction_world`, so
+    the fitted offset is valid in use. A touch is omitted if the detector does not accept the
+    marker.
 
     apparatus: true parameters of the simulated hardware.
     calibration: camera parameters that the detector uses; None: the scene's parameters.

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.bundle import (
     LEFT,
@@ -25,9 +24,8 @@ from flexsheet.launch.calibration.bundle import (
     to_floats,
 )
 from flexsheet.launch.calibration.corners import BoardPair, Progress, ignore_progress
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import rigid
-
-Floats = NDArray[np.float64]
 
 GROUPS = 20
 """The maximum number of jackknife refits.

@@ -120,8 +120,10 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
         words.print("capture stopped; using the pairs captured so far")
     missing = capture.missing()
     if missing:
-        listed = ", ".join(f"{one.group} {one.name}".strip() for one in missing)
-        words.print(f"not covered: {listed}")
+        from flexsheet.launch.calibration.capture import describe_requirement
+
+        listed = ", ".join(dict.fromkeys(map(describe_requirement, missing)))
+        words.print(f"too few image pairs show the board: {listed}")
     if not accepted:
         raise CommandError(
             "no image pair was accepted, because the board was never at rest and fully visible in "
@@ -142,8 +144,7 @@ def _show_coverage(capture: Capture) -> Iterator[Any]:
 
         def print_accepted(hint: str, accepted: bool) -> None:
             if accepted:
-                missing = len(capture.missing())
-                words.print(f"pair accepted; {missing} coverage bins incomplete")
+                words.print(f"pair {hint}")
 
         yield print_accepted
         return

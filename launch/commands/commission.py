@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -191,7 +192,9 @@ def commission(
             if name in skips:
                 lab.skip(name, skips[name])
             elif name in repeats or name not in lab.state.steps:
-                words.print(f"step {name}")
+                expected_s = lab.expected_s(name)
+                duration = "" if expected_s is None else f", about {math.ceil(expected_s)} s"
+                words.print(f"step {name}{duration}")
                 lab.run(name, devices.steps[name])
     except MissingDataError as error:
         missing = error
