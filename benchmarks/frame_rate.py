@@ -29,7 +29,7 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Display, Skin, SoftBody
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh, mesh_spec, world_from_mesh
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
@@ -60,7 +60,7 @@ def find_driver() -> str:
 
 def compute_skin(scene: Scene) -> Skin:
     """Compute the solver's skin with the demo's spacing."""
-    mesh = mesh_scene(scene, SKIN_SPACING_M)
+    mesh = build_mesh(mesh_spec(scene, SKIN_SPACING_M))
     points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
     return Skin(
         mesh_id="bench",

@@ -20,9 +20,9 @@ from flexsheet.launch.calibration.capture import (
     TILTS,
     Bin,
     Capture,
-    _describe_cell,
     classify_tilt,
     compute_required_counts,
+    describe_requirement,
 )
 from flexsheet.launch.calibration.check import check_stereo
 from flexsheet.launch.calibration.corners import (
@@ -268,7 +268,8 @@ def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
         assert printed in capture._make_hint("")
         capture.counts[one] = 8
         assert picture[0].shape == (camera.height_px, camera.width_px)
-    assert _describe_cell(Bin("right cell", "0,0")) == "at the top left of"
+    top_left = Bin("right cell", "0,0")
+    assert describe_requirement(top_left) == "at the top left of the right image"
 
 
 def test_coverage_image_shows_missing_parts(camera: StereoCamera) -> None:

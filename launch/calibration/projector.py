@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from flexsheet.launch.calibration.gray_code import DecodeError, Image, decode_patterns, find_pixels
+from flexsheet.launch.calibration.gray_code import DecodeError, decode_patterns, find_pixels
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, Pose, Projector, StereoCamera
-from flexsheet.nodes.arrays import Bools, Floats
+from flexsheet.nodes.arrays import Bools, Floats, Image
 from flexsheet.nodes.models.camera import camera_matrix, normalize, project
 from flexsheet.nodes.models.rigid import (
     apply,

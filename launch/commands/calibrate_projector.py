@@ -30,10 +30,10 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import require_projector
 
 if TYPE_CHECKING:
-    from flexsheet.launch.calibration.gray_code import Image
     from flexsheet.launch.calibration.projector import ProjectorFit
     from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.scene import Projector, Scene, StereoCamera
+    from flexsheet.nodes.arrays import Image
 
     Views = tuple[list[Image], list[Image]]
 

@@ -174,8 +174,8 @@ def commission(
                 lab.skip(name, skips[name])
             elif name in repeats or name not in lab.state.steps:
                 expected_s = lab.expected_s(name)
-                duration = "" if expected_s is None else f", about {math.ceil(expected_s)} s"
-                words.print(f"step {name}{duration}")
+                expected = "" if expected_s is None else f", about {math.ceil(expected_s)} s"
+                words.print(f"step {name}{expected}")
                 lab.run(name, devices.steps[name])
     except MissingDataError as error:
         missing = error
