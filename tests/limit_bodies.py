@@ -10,7 +10,8 @@ import numpy as np
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats, Singles
 from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
-from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, compute
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.scenes import load_cylinder
