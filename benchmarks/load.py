@@ -36,7 +36,11 @@ from ruamel.yaml import YAML
 
 from benchmarks.soak import start_busy_process
 from flexsheet.launch.commands.output import print_rows
-from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
+from flexsheet.launch.experiments import (
+    ArmsNotReadyError,
+    ExperimentError,
+    ExperimentInterruptedError,
+)
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import DEMO_FILE, run_experiment
@@ -258,7 +262,7 @@ def read_value(row: Mapping[str, Any], key: str) -> float | None:
 def find_state(row: Mapping[str, Any], scene: Scene) -> State:
     """Return the state of a level, from the arms' modes and the ratios of errors to tolerances."""
     if "error" in row:
-        return State.FAILED
+        return State.HOLDS if "followed" in row else State.FAILED
     if row["modes"].keys() - {"follow", "hold"}:
         return State.STOPS
     if "hold" in row["modes"]:
@@ -294,9 +298,10 @@ def measure_factor(
                 rows[row_name] = run(name, level, seconds)
             except ExperimentInterruptedError:
                 raise
+            except ArmsNotReadyError as error:
+                rows[row_name] = {"error": str(error)[:600], "followed": 0.0}
             except (ExperimentError, AssertionError) as error:
                 rows[row_name] = {"error": str(error)[:600]}
-            rows[row_name] |= {"load": describe_load()}
             text = json.dumps(replace_non_finite(rows[row_name]), indent=1)
             write_file(own / f"{row_name}.json", text + "\n")
     scene = load_scene(SCENE_FILE)
@@ -368,6 +373,33 @@ def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         save_svg(figure, path)
 
 
+def render(path: Path) -> str:
+    """Return the levels of each factor by their state, from a recorded result, in Markdown."""
+    record = json.loads(path.read_text(encoding="utf-8"))
+    rows = record["results"]["rows"]
+    heads = ("factor", *(state.value.replace("_", " ") for state in State), "beyond its tolerance")
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for name in dict.fromkeys(row["factor"] for row in rows):
+        own = [row for row in rows if row["factor"] == name]
+        cells = [
+            ", ".join(f"{row['level']:g}" for row in own if row["state"] == state) or "-"
+            for state in State
+        ]
+        beyond = {label for row in own for label, one in row["tolerance_ratios"].items() if one > 1}
+        cells.append(", ".join(sorted(beyond)) or "-")
+        lines.append(f"| {name}, {own[0]['unit']} | {' | '.join(cells)} |")
+    violated = sorted({one for row in rows for one in row.get("violations", ())})
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"Violated limits: {', '.join(violated) or 'none'}. {record['machine']}; "
+            f"`{record['command']}`.",
+            "",
+        ]
+    )
+
+
 def select_levels(factor: Factor, *, quick: bool) -> tuple[float, ...]:
     """Return all levels of a factor, or with `quick` the first and the last one."""
     return (factor.levels[0], factor.levels[-1]) if quick else factor.levels
@@ -385,6 +417,8 @@ def main() -> int:
     if (why := missing()) and any(FACTORS[name].on_cables for name in factors):
         print(f"the factors of the network are skipped: {why}", file=sys.stderr)
         factors = [name for name in factors if not FACTORS[name].on_cables]
+    if busy := describe_load():
+        print(busy, file=sys.stderr)
     rows = [
         row
         for name in factors

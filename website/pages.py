@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from benchmarks import scenes, soft_body_size
+from benchmarks import load, scenes, soft_body_size
 from flexsheet.launch.methods import charts
 from flexsheet.launch.plans.drawing import svg
 from website import (
@@ -44,6 +44,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "charts": lambda: render_charts(CHARTS),
     "commands": commands_page.render,
     "errors": commands_page.render_errors,
+    "load": lambda: load.render(RESULTS / "load.json"),
     "message-header": messages_page.render_header,
     "message-types": messages_page.render_types,
     "mxt-packet": arms_page.render_packet,

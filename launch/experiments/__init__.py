@@ -29,6 +29,13 @@ class ExperimentInterruptedError(ExperimentError):
     remedy = "Start the experiment again; a sweep continues with the trials that are missing."
 
 
+class ArmsNotReadyError(ExperimentError):
+    """Raised if the arms do not follow the sheet target in time."""
+
+    code = "arms-not-ready"
+    remedy = "The notes of the arm bridges name the limit or the node that holds the arms."
+
+
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
     """Check names and remove duplicates; if there are no names, return all known names.
 

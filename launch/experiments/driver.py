@@ -14,7 +14,7 @@ from typing import Literal, Self, get_args
 
 import numpy as np
 
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ArmsNotReadyError, ExperimentError
 from flexsheet.launch.plans.plan_model import TOOLS, ResolvedGraph
 from flexsheet.launch.running.runs import Run
 from flexsheet.launch.running.tools import GraphWriter, make_subscriber
@@ -169,11 +169,15 @@ class Driver:
         self._settled_since = self._settled_since + 1 if settled else 0
 
     async def wait_for(
-        self, condition: Callable[[], bool], description: str, seconds: float
+        self,
+        condition: Callable[[], bool],
+        description: str,
+        seconds: float,
+        error: type[ExperimentError] = ExperimentError,
     ) -> None:
         """Wait until `condition` returns True; it is evaluated when a message arrives.
 
-        description: text for the error. Raises ExperimentError after `seconds`.
+        description: text for the error. Raises `error` after `seconds`.
         """
         if condition():
             return
@@ -185,7 +189,7 @@ class Driver:
                 await future
         except TimeoutError:
             notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
-            raise ExperimentError(
+            raise error(
                 f"timeout: waited {seconds:g} s for {description}{_describe_load()}; "
                 f"notes of the nodes:{notes or ' none'}"
             ) from None
@@ -198,7 +202,8 @@ class Driver:
     async def wait_ready(self) -> None:
         """Wait until both arms are in mode "follow".
 
-        If a node of the graph publishes soft bodies, also wait for the first soft body.
+        If a node of the graph publishes soft bodies, also wait for the first soft body. Raises
+        ArmsNotReadyError after three times `WAIT_S`.
         """
         needs_body = bool(self._plan.writers.get("soft_body"))
 
@@ -208,7 +213,8 @@ class Driver:
             return following and (not needs_body or "soft_body" in self._newest)
 
         what = " and a soft body" if needs_body else ""
-        await self.wait_for(ready, f"both arms in mode follow{what}", 3 * WAIT_S)
+        waited = f"both arms in mode follow{what}"
+        await self.wait_for(ready, waited, 3 * WAIT_S, ArmsNotReadyError)
 
     async def wait_for_table(
         self, scene: Scene, method: TableMethod, progress: Callable[[str], None]
