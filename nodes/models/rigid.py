@@ -7,11 +7,11 @@ twist is a vector (6,) in the world frame: linear velocity (m/s), then angular v
 from __future__ import annotations
 
 from math import atan2, cos, hypot, inf, isfinite, nan, sin, sqrt
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flexsheet.messages.scene import Pose
 from flexsheet.nodes.arrays import Floats
 
 _UNIT: Floats = np.eye(4)
@@ -123,6 +123,16 @@ def transform(rotation: Floats, position: ArrayLike) -> Floats:
 def transform_from_rpy(position_m: ArrayLike, rpy_rad: ArrayLike) -> Floats:
     """Return the transform (4, 4) of a position (3,), m, and roll, pitch, yaw (3,), rad."""
     return transform(rotation_from_rpy(rpy_rad), position_m)
+
+
+class Pose(Protocol):
+    """The interface of objects that describe a pose: position (m) and roll, pitch, yaw (rad)."""
+
+    @property
+    def position_m(self) -> ArrayLike: ...
+
+    @property
+    def rpy_rad(self) -> ArrayLike: ...
 
 
 def pose_matrix(pose: Pose) -> Floats:
