@@ -602,11 +602,13 @@ def stability(
             experiment.StabilitySettings(hands=hands, seed=seed),
             progress,
         )
-    (folder / "stability.json").write_text(json.dumps(result, indent=1) + "\n")
-    image = folder / "stability.png"
+    file, image = folder / "stability.json", folder / "stability.png"
+    file.write_text(json.dumps(result, indent=1) + "\n")
     draw_stability(result, image)
     if as_json:
-        print_json({**result, "picture": str(image)})
+        lists = ("rows", "without_bounds", "boundary")
+        summary = {key: value for key, value in result.items() if key not in lists}
+        print_json({**summary, "file": str(file), "picture": str(image)})
         return
     rows = [*result["rows"], *result["without_bounds"]]
     cells = []

@@ -326,11 +326,18 @@ def stability_result(
     boundary = measure_boundary(settings, progress)
     rows = measure_map(scene, model, curve, settings, progress)
     errors = np.abs([row["error_percent"] for row in boundary])
+    bounded = [row for row in rows if row["kind"] == "bounded"]
+    unbounded = [row for row in rows if row["kind"] != "bounded"]
     return {
         "scene": scene.name,
         "seed": settings.seed,
-        "rows": [row for row in rows if row["kind"] == "bounded"],
-        "without_bounds": [row for row in rows if row["kind"] != "bounded"],
+        "cases": {"bounded": len(bounded), "unbounded": len(unbounded)},
+        "unstable": {
+            "bounded": sum(not row["stable"] for row in bounded),
+            "unbounded": sum(not row["stable"] for row in unbounded),
+        },
+        "rows": bounded,
+        "without_bounds": unbounded,
         "boundary_error_percent": float(np.percentile(errors, 95.0)) if len(errors) else None,
         "boundary_median_percent": float(np.median(errors)) if len(errors) else None,
         "boundary": boundary,
