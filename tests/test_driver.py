@@ -104,3 +104,4 @@ async def test_a_timeout_on_an_overloaded_computer_names_the_overload(
         await driver.wait_for(lambda: False, "the image", 0.0)
     assert type(failed.value) is kind
     assert ("renderer waits for a processor 96% of the time" in str(failed.value)) == busy
+    assert ("end other programs" in str(failed.value)) == busy

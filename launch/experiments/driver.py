@@ -250,8 +250,11 @@ class Driver:
         """
         busy = [text for host in self._hosts.values() if (text := describe_busy(host))]
         notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
-        kind = OverloadedError if busy else ExperimentError
-        return kind("; ".join([what, *busy, f"notes of the nodes:{notes or ' none'}"]))
+        ending = f"notes of the nodes:{notes or ' none'}"
+        if not busy:
+            return ExperimentError(f"{what}; {ending}")
+        remedy = "end other programs, and check the row `load` of `flexsheet doctor`"
+        return OverloadedError("; ".join([what, *busy, remedy, ending]))
 
     def newest(self, topic: str) -> Message | None:
         return self._newest.get(topic)
