@@ -13,13 +13,17 @@ SOURCES := flexsheet messages nodes launch benchmarks website
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test test-parallel test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits load tune-scenes \
+.PHONY: help setup demo try test test-parallel test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits load tune-scenes \
 	pages charts \
 	docs lock release clean
 
-# Install what is needed to run; `make test` and `make lint` install the development packages.
-setup: $(STAMP)
+# `make test` and `make lint` install the development packages.
+setup: $(STAMP)  ## install what is needed to run, and start nothing
 	@$(BIN)/python -m tests.system_packages
+
+# List the targets with the texts after `##`.
+help:  ## list all targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' Makefile | sort | expand -t 14
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -36,9 +40,8 @@ $(DEV_STAMP): requirements-dev.lock $(STAMP)
 	$(INSTALL) --require-hashes -r requirements-dev.lock
 	@touch $@
 
-# Write all lock files again, after a change of pyproject.toml or website/requirements.in. Pinned
-# versions are kept where possible.
-lock:
+# The sources are pyproject.toml and website/requirements.in. Pinned versions are kept where possible.
+lock:  ## write all lock files again, after a change of dependencies
 	$(PYTHON) -m venv $(LOCK)
 	$(LOCK)/bin/pip install --quiet --disable-pip-version-check pip-tools
 	$(call compile,--all-build-deps --extra export,requirements.lock,pyproject.toml)
@@ -49,14 +52,13 @@ compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) 
 	--strip-extras --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
 	--no-emit-find-links -o $(2) $(3)
 
-demo: setup
+demo: setup  ## run the experiments of the paper, and draw pictures
 	$(BIN)/flexsheet demo
 
-# Open a page in the browser, and touch the object with the mouse.
-try: setup
+try: setup  ## open a page in the browser, and touch the object with the mouse
 	$(BIN)/flexsheet try
 
-lint: $(DEV_STAMP)
+lint: $(DEV_STAMP)  ## check style, words and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m tests.check_words
@@ -78,7 +80,7 @@ test-parallel: cached
 # Tests marked `alone` depend on timing and run one at a time; the others run in parallel, beside the
 # linters. Both parts run, even if the first fails. The last lines list the skipped tests with the
 # reasons.
-test: $(DEV_STAMP)
+test: $(DEV_STAMP)  ## run the linters and all tests except the long ones
 	@$(BIN)/python -m tests.system_packages --tests
 	@mkdir -p build && : > $(SKIPPED)
 	@status=0; \
@@ -92,8 +94,7 @@ test: $(DEV_STAMP)
 	else echo "no test was skipped"; fi; \
 	exit $$status
 
-# Tests that are too long for `make test`: studies, and property tests with more random examples.
-test-long: $(DEV_STAMP) cached
+test-long: $(DEV_STAMP) cached  ## run the long tests: studies, and property tests with more random examples
 	@status=0; \
 	export OPENBLAS_NUM_THREADS=1; set -x; \
 	$(BIN)/pytest -m long --durations=15 || status=$$?; \
@@ -101,8 +102,7 @@ test-long: $(DEV_STAMP) cached
 		--numprocesses $(WORKERS) --dist worksteal $$(grep -l @given tests/test_*.py) || status=$$?; \
 	exit $$status
 
-# Measure the figures in docs/results.md.
-bench: setup $(DEV_STAMP)
+bench: setup $(DEV_STAMP)  ## measure the figures in docs/results.md
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
 	$(BIN)/python -m benchmarks.scenes
@@ -112,48 +112,38 @@ bench: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_regret --output docs/charts
 
-# Measure frame time, frame rate and lag with the graphics card, and add them to docs/charts. Exit
-# code 3: the machine has no graphics card.
-bench-gpu: setup
+# Exit code 3: the machine has no graphics card.
+bench-gpu: setup  ## measure frame time, frame rate and lag with the graphics card, for docs/charts
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.frame_rate --output docs/charts
 
-# Compare with other messaging libraries, in a separate network namespace (requires root).
-bench-peers: setup
+bench-peers: setup  ## compare with other messaging libraries, in a separate network namespace (requires root)
 	$(INSTALL) --no-build-isolation -e '.[peers]'
 	$(BIN)/python -m benchmarks.messaging_peers
 
-# Kill processes, and cut and disturb connections between three simulated computers (requires root).
-faults: setup $(DEV_STAMP)
+faults: setup $(DEV_STAMP)  ## kill processes, and disturb connections between three simulated computers (requires root)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
 
-# Execute the commands of docs/deploy.md on three simulated computers (requires root).
-deploy-trial: setup $(DEV_STAMP)
+deploy-trial: setup $(DEV_STAMP)  ## execute the commands of docs/deploy.md on three simulated computers (requires root)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.deploy_trial
 
-# Run strokes and pushes for an hour, to find leaks, drift and losses (docs/soak.md).
-soak: setup
+soak: setup  ## run strokes and pushes for an hour, to find leaks, drift and losses (docs/soak.md)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soak
 
-# Fuzz every decoder of external data for five minutes each; installs the fuzzer first.
-fuzz: setup
+fuzz: setup  ## install the fuzzer, and fuzz every decoder of external data for five minutes each
 	$(INSTALL) --no-build-isolation -e '.[fuzz]'
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fuzz
 
-# Measure the disturbances of the fingertip in docs/limits.md.
-limits: setup $(DEV_STAMP)
+limits: setup $(DEV_STAMP)  ## measure the disturbances of the fingertip in docs/limits.md
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
-# Insert figures from docs/results into the pages, and draw docs/images.
-pages: setup
+pages: setup  ## insert figures from docs/results into the pages, and draw docs/images
 	$(BIN)/python -m website.pages
 
-# Measure every method of every family for docs/charts; takes half an hour.
-charts: setup
+charts: setup  ## measure every method of every family for docs/charts; takes half an hour
 	$(BIN)/flexsheet chart --output docs/charts
 
-# Tune all shipped scenes on an idle machine; takes hours. An interrupted command continues, because
-# finished scenes and strokes in runs/tune are not repeated.
-tune-scenes: setup
+# An interrupted command continues, because finished scenes and strokes in runs/tune are not repeated.
+tune-scenes: setup  ## tune all shipped scenes on an idle machine; takes hours
 	@mkdir -p runs/tune; status=0; \
 	for scene in launch/scenes/*.yaml; do \
 		folder=runs/tune/$$(basename $$scene .yaml); \
@@ -163,28 +153,26 @@ tune-scenes: setup
 		case $$code in 0|3) mv $$folder.part $$folder.json ;; *) status=1 ;; esac; \
 	done; exit $$status
 
-# Measure errors, latency and safety against load (requires root). An interrupted command continues.
-load: setup $(DEV_STAMP)
+# An interrupted command continues.
+load: setup $(DEV_STAMP)  ## measure errors, latency and safety against load (requires root)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.load --output runs/load
 
-# Build the documentation site, site/index.html, with the generated reference tables and charts. The
-# generator has a separate virtual environment.
+# The generator of the documentation site has a separate virtual environment.
 $(SITE_STAMP): website/requirements.lock
 	$(PYTHON) -m venv $(SITE_VENV)
 	$(SITE_VENV)/bin/pip install --quiet --disable-pip-version-check --require-hashes \
 		-r website/requirements.lock
 	@touch $@
 
-docs: setup $(SITE_STAMP)
+docs: setup $(SITE_STAMP)  ## build the documentation site, site/index.html
 	$(BIN)/python -m website.pages site
 	$(SITE_VENV)/bin/python -m zensical build --clean --strict
 	$(SITE_VENV)/bin/python -m website.finish site
 
-# Write source archive, wheel and checksums to dist/. The wheel is built from the archive, which
-# shows that the archive is complete.
+# The wheel is built from the source archive, which shows that the archive is complete.
 BUILD = $(CURDIR)/$(BIN)/python -c "import sys; from setuptools import build_meta; \
 	getattr(build_meta, sys.argv[1])(sys.argv[2])"
-release: setup
+release: setup  ## write source archive, wheel and checksums to dist/
 	rm -rf dist share build/source
 	mkdir -p share/man/man1 build/source dist
 	$(BIN)/flexsheet man > share/man/man1/flexsheet.1
@@ -197,6 +185,6 @@ release: setup
 		echo "note: CHANGELOG.md has no section [$$version]; this build is not a release" >&2
 	@ls -1 dist
 
-clean:
+clean:  ## remove everything that the other targets have made
 	rm -rf $(VENV) $(SITE_VENV) site .cache build dist share runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

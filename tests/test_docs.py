@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from collections import Counter
 from pathlib import Path
 
@@ -94,6 +95,12 @@ def test_the_documentation_is_short() -> None:
     assert count_words(ROOT / "README.md") <= MAX_README_WORDS
     by_hand = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *site_pages()]
     assert sum(map(count_words, by_hand)) <= MAX_WORDS
+
+
+def test_make_help_lists_the_targets_that_the_readme_names() -> None:
+    listed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True)
+    targets = {line.split()[0] for line in listed.stdout.splitlines()}
+    assert set(re.findall(r"make ([a-z-]+)", (ROOT / "README.md").read_text())) <= targets
 
 
 def test_drawings_are_up_to_date() -> None:

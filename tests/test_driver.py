@@ -8,13 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flexsheet.launch.experiments import ExperimentError, OverloadedError
+from flexsheet.launch.experiments import driver as driving
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.stroke import stroke_path
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import Run
-from flexsheet.messages.base import Header
-from flexsheet.messages.types import TwinFinger
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.types import CpuPressure, TwinFinger
+from tests.test_busy import host
 from tests.test_planner import SCENE
+from tests.test_visible_lag import frame
+from tests.waiting import DEADLINE_S
 
 DEMO_FILE = Path(__file__).parents[1] / "launch" / "demo.yaml"
 
@@ -46,3 +51,57 @@ async def test_a_path_with_the_label_of_the_previous_path_is_awaited(
     assert not follow.done()
     await receive(done=True)
     assert follow.done()
+
+
+def make_driver(monkeypatch: pytest.MonkeyPatch) -> Driver:
+    """Make a driver that receives only the messages that the test passes."""
+    driver = Driver(load_graph(DEMO_FILE), Run("unused", Path("unused")))
+    monkeypatch.setattr(driver, "show", lambda display: None)
+    monkeypatch.setattr(driver, "_subscribe", lambda name: None)
+    return driver
+
+
+def receive(driver: Driver, topic: str, message: Message) -> None:
+    driver._make_handler(topic)(message, Header(1, 1, 1, "clock", "n", 1))
+
+
+async def test_the_wait_for_an_image_continues_while_frames_arrive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(driving, "MAX_IMAGE_FRAMES", 2)
+    driver = make_driver(monkeypatch)
+    capture = asyncio.create_task(driver.capture_image("pushed", "none"))
+    await asyncio.sleep(0)
+    (waiter,) = driver._waiters
+    deadlines = [waiter.deadline.when()]
+    for _ in range(4):
+        receive(driver, "frame", frame(0.0, 0.0, 0.0, 0.0))
+        deadlines.append(waiter.deadline.when())
+    capture.cancel()
+    assert deadlines[0] < deadlines[1] < deadlines[2] == deadlines[3] == deadlines[4]
+
+
+async def test_frames_without_an_image_end_the_wait_at_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(driving, "MAX_IMAGE_WAIT_S", 0.0)
+    driver = make_driver(monkeypatch)
+    capture = asyncio.create_task(driver.capture_image("pushed", "none"))
+    await asyncio.sleep(0)
+    receive(driver, "frame", frame(0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(ExperimentError, match=r'image of "pushed", during 1 frames'):
+        await asyncio.wait_for(capture, DEADLINE_S)
+
+
+@pytest.mark.parametrize(("busy", "kind"), [(True, OverloadedError), (False, ExperimentError)])
+async def test_a_timeout_on_an_overloaded_computer_names_the_overload(
+    monkeypatch: pytest.MonkeyPatch, busy: bool, kind: type[ExperimentError]
+) -> None:
+    driver = make_driver(monkeypatch)
+    cpu = CpuPressure(busy=busy, wait_ratio=0.96, node="renderer")
+    receive(driver, "host", host(cpu=cpu))
+    with pytest.raises(ExperimentError, match="for the image") as failed:
+        await driver.wait_for(lambda: False, "the image", 0.0)
+    assert type(failed.value) is kind
+    assert ("renderer waits for a processor 96% of the time" in str(failed.value)) == busy
+    assert ("end other programs" in str(failed.value)) == busy

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.launch.running import priority
+from flexsheet.launch.running import child, priority
 from flexsheet.launch.running.priority import MIN_NICE, describe_nice_problem, min_nice_step
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -70,6 +70,22 @@ def test_root_is_not_advised_to_become_root(
     problem = describe_nice_problem(list(DEMO.nodes.values()))
     assert problem is not None
     assert [one for one in ("CAP_SYS_NICE", "start as root") if one in problem] == [remedy]
+
+
+@pytest.mark.parametrize(
+    ("nice", "launcher", "written"),
+    [(3, 10, "13"), (0, 10, "10"), (-10, 10, ""), (-10, 0, "-10"), (3, -5, "3"), (0, 0, "")],
+)
+def test_a_session_of_a_nice_launcher_is_nice(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, nice: int, launcher: int, written: str
+) -> None:
+    autogroup = tmp_path / "autogroup"
+    autogroup.touch()
+    monkeypatch.setattr(child, "AUTOGROUP", autogroup)
+    monkeypatch.setattr(os, "nice", lambda step: launcher + step)
+    monkeypatch.setenv(child.NICE_VARIABLE, str(nice))
+    child.apply_niceness()
+    assert autogroup.read_text() == written
 
 
 def test_what_the_arms_wait_for_goes_before_all_else_in_the_demo() -> None:

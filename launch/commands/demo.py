@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +16,10 @@ from flexsheet.launch.commands.experiment import (
     print_strokes,
 )
 from flexsheet.launch.commands.output import examples, print_json, progress_words, words
+from flexsheet.messages.errors import FlexsheetError
+
+if TYPE_CHECKING:
+    from flexsheet.launch.experiments.demo import DemoResult
 
 app = options.make_app()
 
@@ -38,29 +45,57 @@ def demo(
     output: options.ResultFolderOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Simulate strokes, a tilted sheet and a pushed sheet, and draw charts of the errors."""
-    from flexsheet.launch.experiments.demo import run_demo
+    """Simulate strokes, a tilted sheet and a pushed sheet, and draw charts of the errors.
+
+    The result of each experiment is printed and saved when the experiment is finished.
+    """
+    from flexsheet.launch.experiments.demo import DemoResult, run_demo
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
     given = options.with_scene(settings, scene)
     path = None if finger_path is None else load_path(launch_file, finger_path, given)
     folder = make_result_folder(output, "demo")
-    with progress_words() as progress:
-        result = run_demo(launch_file, given, folder, progress, path=path, apparatus=apparatus)
+    bag, results = folder / "demo.mcap", DemoResult()
+
+    def report(new: DemoResult) -> None:
+        results.strokes += new.strokes
+        results.followed = new.followed or results.followed
+        images = [one for one in new.images if one not in results.images]
+        results.images += images
+        if not as_json:
+            _print_result(replace(new, images=images))
+
+    try:
+        with progress_words() as progress:
+            run_demo(launch_file, given, bag, progress, report, path=path, apparatus=apparatus)
+    except FlexsheetError:
+        if as_json and bag.exists():
+            _print_results(results, bag)
+        raise
     if as_json:
-        print_json(
-            {
-                "strokes": result.strokes,
-                "followed": result.followed,
-                "bag": str(result.bag),
-                "figures": [str(image) for image in result.images],
-            }
-        )
-        return
+        _print_results(results, bag)
+    else:
+        words.print(f"bag: {bag}")
+
+
+def _print_result(result: DemoResult) -> None:
+    """Print the result of one experiment."""
     if result.strokes:
         print_strokes(result.strokes)
     if result.followed is not None:
         print_followed([result.followed])
-    words.print(f"bag: {result.bag}")
+    sys.stdout.flush()
     for image in result.images:
         words.print(f"image: {image}")
+
+
+def _print_results(result: DemoResult, bag: Path) -> None:
+    """Print the results of all finished experiments as JSON."""
+    print_json(
+        {
+            "strokes": result.strokes,
+            "followed": result.followed,
+            "bag": str(bag),
+            "figures": [str(image) for image in result.images],
+        }
+    )

@@ -241,7 +241,8 @@ def progress_words() -> Iterator[Callable[[str], None]]:
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=words.console) as bar:
+    # Results on stdout are printed above the progress line, unless stdout is a file or a pipe.
+    with Progress(*columns, console=words.console, redirect_stdout=sys.stdout.isatty()) as bar:
         task = bar.add_task("", total=None)
         yield lambda text: bar.update(task, description=text)
 

@@ -19,7 +19,21 @@ class ExperimentError(FlexsheetError, RuntimeError):
     """Raised if an experiment fails, or if a bag does not contain the data of the experiment."""
 
     code = "experiment"
-    remedy = "Try `launch/demo.yaml` first. A bag must be a recording of the same experiment."
+    remedy = (
+        "Correct what the text names. If your launch file may be the cause, compare with "
+        "`launch/demo.yaml`. A bag must be a recording of the same experiment."
+    )
+
+
+class OverloadedError(ExperimentError):
+    """Raised if an experiment waits too long on a computer with too few free processors."""
+
+    code = "overloaded"
+    remedy = (
+        "End other programs until the row `load` of `flexsheet doctor` is ok, and start the "
+        "experiment again. Its nodes may wait for a processor in at most a quarter of the time, "
+        "and need two free cores."
+    )
 
 
 class ExperimentInterruptedError(ExperimentError):

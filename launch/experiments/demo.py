@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,11 @@ from flexsheet.launch.bags.report.strokes import read_followed
 from flexsheet.launch.experiments import find_recorded, image, stroke
 from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from flexsheet.launch.experiments.run import (
+    Procedure,
     Progress,
     chain_procedures,
+    is_path_recorded,
+    make_evaluation,
     make_image_procedure,
     make_settings,
     make_stroke_procedure,
@@ -29,55 +33,108 @@ It is sufficient for figures, and images take a quarter of the time of the defau
 """
 
 SECONDS = (10.0, 30.0)
-TILT_DEG = -40
-TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
-DEPTH_MM = 30
-PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass")
+IMAGES: tuple[tuple[image.Series, float, tuple[Correction, ...]], ...] = (
+    (image.TILT, -40, ("none", "one_plane", "two_pass")),
+    (image.PUSH, 30, ("none", "four_triangles", "two_pass")),
+)
+"""The image experiments, each with one value and its corrections of the image."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class DemoResult:
-    """The results of the demo.
+    """The results of the experiments of the demo that are finished.
 
     strokes: one result per stroke. followed: errors of the sheet along the given finger path; None
     if no path was given.
     """
 
-    folder: Path
-    bag: Path
-    strokes: list[dict[str, Any]]
-    followed: dict[str, Any] | None
-    images: list[Path]
+    strokes: list[dict[str, Any]] = field(default_factory=list)
+    followed: dict[str, Any] | None = None
+    images: list[Path] = field(default_factory=list)
+
+
+Report = Callable[[DemoResult], None]
 
 
 def run_demo(
     launch_file: Path,
     settings: Sequence[str],
-    folder: Path,
+    bag: Path,
     progress: Progress,
+    report: Report,
     *,
     path: FingerPath | None = None,
     apparatus: str | None = None,
-) -> DemoResult:
-    """Run the demo on a graph, and return its results.
+) -> None:
+    """Run the demo on a graph, and report the result of each experiment when it is finished.
 
     The finger makes strokes of 10 s and 30 s, or follows `path`. Images of a tilted and of a pushed
-    sheet are captured. The bag and the figures are written to `folder`.
+    sheet are captured. Results and figures are written to the folder of the bag. `report` receives
+    the results that are new.
     """
-    bag = folder / "demo.mcap"
-    procedure = chain_procedures(
-        make_stroke_procedure(SECONDS, progress, path=path),
-        make_image_procedure(image.TILT, [TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
-        make_image_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
-    )
+    procedure = chain_procedures(*make_demo_procedures(bag, progress, report, path))
     coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     given = [*coarse, *settings]
     run_experiment(
         launch_file, given, bag, procedure, progress, apparatus=apparatus, needed=["twin/eye"]
     )
+
+
+def make_demo_procedures(
+    bag: Path, progress: Progress, report: Report, path: FingerPath | None
+) -> list[Procedure]:
+    """Make the procedures of the experiments, and of the evaluation after each experiment."""
+    made: list[Procedure] = []
+
+    def add(procedure: Procedure, evaluate: Callable[[], DemoResult | None], name: str) -> None:
+        made.extend((procedure, make_evaluation(evaluate, report, name)))
+
     if path is None:
-        return summarize(bag, folder, strokes=SECONDS)
-    return summarize(bag, folder, strokes=(), path_label=path.label)
+        for number, seconds in enumerate(SECONDS, 1):
+            evaluate = partial(evaluate_strokes, bag, SECONDS[:number])
+            procedure = make_stroke_procedure([seconds], progress)
+            add(procedure, evaluate, stroke.stroke_label(seconds))
+    else:
+        procedure = make_stroke_procedure((), progress, path=path)
+        add(procedure, partial(evaluate_path, bag, path.label), path.label)
+    for number, (series, value, corrections) in enumerate(IMAGES, 1):
+        procedure = make_image_procedure(series, [value], corrections, progress, shading="soft")
+        add(procedure, partial(evaluate_images, bag, number), series.name.format(value))
+    return made
+
+
+def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
+    """Evaluate the recorded strokes, and return the result of the last stroke.
+
+    strokes: durations of the strokes up to now, s. Returns None if the bag does not yet contain the
+    last stroke. The results of all strokes are written to a file and drawn.
+    """
+    if not is_path_recorded(bag, stroke.stroke_label(strokes[-1])):
+        return None
+    recording = stroke.read_recording(bag)
+    errors = {seconds: stroke.stroke_errors(recording, seconds) for seconds in strokes}
+    results = [
+        stroke.stroke_result(recording, one, seconds, bag) for seconds, one in errors.items()
+    ]
+    write_file(bag.parent / "stroke.json", json.dumps(results, indent=1) + "\n")
+    plot, latency = bag.parent / "stroke.png", bag.parent / "latency.png"
+    draw_stroke(errors, plot)
+    draw_latency(recording, latency)
+    return DemoResult(strokes=results[-1:], images=[plot, latency])
+
+
+def evaluate_path(bag: Path, label: str) -> DemoResult | None:
+    """Evaluate the finger path that has the given label.
+
+    Returns None if the bag does not yet contain the path.
+    """
+    if not is_path_recorded(bag, label):
+        return None
+    followed = read_followed_path(bag, label)
+    write_file(bag.parent / "followed.json", json.dumps(followed, indent=1) + "\n")
+    latency = bag.parent / "latency.png"
+    draw_latency(stroke.read_recording(bag), latency)
+    return DemoResult(followed=followed, images=[latency])
 
 
 def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
@@ -89,38 +146,17 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
     return find_recorded(runs, "finger path", label)
 
 
-def summarize(
-    bag: Path, folder: Path, *, strokes: tuple[float, ...], path_label: str | None = None
-) -> DemoResult:
-    """Compute the results of the demo from its bag, and draw its figures into `folder`.
+def evaluate_images(bag: Path, count: int) -> DemoResult | None:
+    """Draw the images of the simulated eye in the first `count` cases of IMAGES.
 
-    strokes: durations of the recorded strokes, s. path_label: label of a recorded finger path.
+    Returns None if the bag does not yet contain all of them.
     """
-    recording = stroke.read_recording(bag)
-    eye_images = image.read_images(bag)
-    views, plot, latency = (folder / f"{name}.png" for name in ("eye", "stroke", "latency"))
-    tilted, pushed = (
-        [find_recorded(eye_images, "image", series.label(value, name)) for name in corrections]
-        for series, value, corrections in (
-            (image.TILT, TILT_DEG, TILT_CORRECTIONS),
-            (image.PUSH, DEPTH_MM, PUSH_CORRECTIONS),
-        )
-    )
-    draw_eye_views(
-        [(f"sheet tilted {TILT_DEG}°", tilted), (f"sheet pushed {DEPTH_MM} mm", pushed)], views
-    )
-    draw_latency(recording, latency)
-    images = [views, latency]
-    errors = {seconds: stroke.stroke_errors(recording, seconds) for seconds in strokes}
-    if errors:
-        draw_stroke(errors, plot)
-        images.append(plot)
-    results = [
-        stroke.stroke_result(recording, one, seconds, bag) for seconds, one in errors.items()
-    ]
-    write_file(folder / "stroke.json", json.dumps(results, indent=1) + "\n")
-    followed = None
-    if path_label is not None:
-        followed = read_followed_path(bag, path_label)
-        write_file(folder / "followed.json", json.dumps(followed, indent=1) + "\n")
-    return DemoResult(folder=folder, bag=bag, strokes=results, followed=followed, images=images)
+    images, rows = image.read_images(bag), []
+    for series, value, corrections in IMAGES[:count]:
+        labels = [series.label(value, one) for one in corrections]
+        if not images.keys() >= set(labels):
+            return None
+        rows.append((f"sheet {series.name.format(value)}", [images[label] for label in labels]))
+    views = bag.parent / "eye.png"
+    draw_eye_views(rows, views)
+    return DemoResult(images=[views])

@@ -1,31 +1,36 @@
 """Control a running graph during an experiment: move the simulated finger and set the display.
 
 The driver publishes with the writer name "tools" and subscribes to the topics that it evaluates.
-Every wait has a deadline. The timeout error names the awaited condition and the nodes' notes.
+Every wait has a deadline. The timeout error names the awaited condition, the notes of the nodes and
+an overload of the computer.
 """
 
 from __future__ import annotations
 
 import asyncio
-import os
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Literal, Self, get_args
 
 import numpy as np
 
-from flexsheet.launch.experiments import ArmsNotReadyError, ExperimentError
+from flexsheet.launch.experiments import ArmsNotReadyError, ExperimentError, OverloadedError
 from flexsheet.launch.plans.plan_model import TOOLS, ResolvedGraph
 from flexsheet.launch.running.runs import Run
 from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.busy import describe_busy
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     ArmState,
     Correction,
     Display,
     FingerPath,
+    Frame,
+    HostStatus,
     Pattern,
     Shading,
     SheetTarget,
@@ -54,6 +59,7 @@ READ = (
     "soft_body",
     "force",
     "status",
+    "host",
 )
 WRITTEN = ("twin/finger_path", "display")
 
@@ -69,7 +75,15 @@ EYE_PIXELS_EVERY = 9
 The interval is odd, so that such frames alternate between both eyes.
 """
 WAIT_S = 20.0
-IMAGE_WAIT_S = 40.0
+FRAME_WAIT_S = 20.0
+"""The maximum time to wait for the next frame, or for the eye's image after the last frame."""
+
+MAX_IMAGE_FRAMES = 600
+MAX_IMAGE_WAIT_S = 300.0
+"""The maximum time to wait for an image of the simulated eye.
+
+An idle computer needs a few seconds.
+"""
 MAX_TABLE_WAIT_S = 3600.0
 """The maximum time to wait for a table of the soft body.
 
@@ -77,11 +91,31 @@ Two idle cores need about a minute for the coarse table, and about eight minutes
 table.
 """
 PROGRESS_PERIOD_S = 5.0
-MAX_LOAD_PER_CORE = 3.0
-"""The load average per core above which the computer is considered overloaded.
 
-The demo causes a lower load.
-"""
+
+@dataclass(slots=True)
+class Waiter:
+    """A wait for a condition, whose deadline frames of the renderer can postpone.
+
+    seconds: time (s) to wait after the start, and after each frame that postpones the deadline.
+    latest_s: latest deadline, in the time of the event loop.
+    frames: number of frames that may still postpone the deadline.
+    """
+
+    condition: Callable[[], bool]
+    future: asyncio.Future[None]
+    deadline: asyncio.Timeout
+    seconds: float
+    latest_s: float
+    frames: int
+
+    def add_frame(self) -> None:
+        """Postpone the deadline, because the renderer has published a frame."""
+        if self.frames == 0 or self.deadline.expired() or self.future.done():
+            return
+        self.frames -= 1
+        until_s = asyncio.get_running_loop().time() + self.seconds
+        self.deadline.reschedule(min(until_s, self.latest_s))
 
 
 class Driver:
@@ -104,31 +138,31 @@ class Driver:
         self.on_message: Callable[[Message], None] = lambda message: None
         self._skin_source_ns = 0
         self._writer: GraphWriter | None = None
-        self._subscribers: list[Subscriber] = []
+        self._subscribers: dict[str, Subscriber] = {}
         self._newest: dict[str, Message] = {}
         self._notes: dict[str, str] = {}
-        self._waiters: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
+        self._hosts: dict[str, HostStatus] = {}
+        self._waiters: list[Waiter] = []
         self._settled_since = 0
 
     async def __aenter__(self) -> Self:
         self._writer = GraphWriter(self._plan, self._run, WRITTEN)
         for name in READ:
-            subscriber = make_subscriber(
-                name,
-                self._plan,
-                self._run,
-                self._make_handler(name),
-                on_problem=self._note_problem,
-            )
-            subscriber.start()
-            self._subscribers.append(subscriber)
+            self._subscribe(name)
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        for subscriber in self._subscribers:
+        for subscriber in self._subscribers.values():
             subscriber.close()
         if self._writer is not None:
             self._writer.close()
+
+    def _subscribe(self, name: str) -> None:
+        subscriber = make_subscriber(
+            name, self._plan, self._run, self._make_handler(name), on_problem=self._note_problem
+        )
+        subscriber.start()
+        self._subscribers[name] = subscriber
 
     def _note_problem(self, text: str) -> None:
         self._notes[TOOLS] = text
@@ -150,9 +184,13 @@ class Driver:
                 self._notes[message.node] = message.note or message.last_error
             if isinstance(message, ArmState):
                 self._count_settled()
-            for condition, future in self._waiters:
-                if not future.done() and condition():
-                    future.set_result(None)
+            if isinstance(message, HostStatus):
+                self._hosts[message.host] = message
+            for waiter in self._waiters:
+                if isinstance(message, Frame):
+                    waiter.add_frame()
+                if not waiter.future.done() and waiter.condition():
+                    waiter.future.set_result(None)
 
         return handle
 
@@ -173,28 +211,54 @@ class Driver:
         condition: Callable[[], bool],
         description: str,
         seconds: float,
+        *,
+        max_frames: int = 0,
+        max_seconds: float = math.inf,
         error: type[ExperimentError] = ExperimentError,
     ) -> None:
         """Wait until `condition` returns True; it is evaluated when a message arrives.
 
-        description: text for the error. Raises `error` after `seconds`.
+        description: text for the error. seconds: time to wait. max_frames: number of frames of the
+        renderer after each of which the time begins again, up to `max_seconds` in total.
+
+        Raises `error` after this time; OverloadedError if a computer is overloaded.
         """
         if condition():
             return
-        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        entry = (condition, future)
-        self._waiters.append(entry)
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[None] = loop.create_future()
+        begun_s = loop.time()
         try:
-            async with asyncio.timeout(seconds):
-                await future
+            async with asyncio.timeout(seconds) as deadline:
+                waiter = Waiter(
+                    condition, future, deadline, seconds, begun_s + max_seconds, max_frames
+                )
+                self._waiters.append(waiter)
+                try:
+                    await future
+                finally:
+                    self._waiters.remove(waiter)
         except TimeoutError:
-            notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
-            raise error(
-                f"timeout: waited {seconds:g} s for {description}{_describe_load()}; "
-                f"notes of the nodes:{notes or ' none'}"
-            ) from None
-        finally:
-            self._waiters.remove(entry)
+            what = f"timeout: waited {loop.time() - begun_s:.3g} s for {description}"
+            if max_frames:
+                what += f", during {max_frames - waiter.frames} frames"
+            raise self.make_timeout_error(what, error) from None
+
+    def make_timeout_error(
+        self, what: str, error: type[ExperimentError] = ExperimentError
+    ) -> ExperimentError:
+        """Return the error of a wait that took too long, with the nodes' notes.
+
+        what: first part of the error text. error: type of the error, unless a computer is
+        overloaded.
+        """
+        busy = [text for host in self._hosts.values() if (text := describe_busy(host))]
+        notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
+        ending = f"notes of the nodes:{notes or ' none'}"
+        if not busy:
+            return error(f"{what}; {ending}")
+        remedy = "end other programs, and check the row `load` of `flexsheet doctor`"
+        return OverloadedError("; ".join([what, *busy, remedy, ending]))
 
     def newest(self, topic: str) -> Message | None:
         return self._newest.get(topic)
@@ -214,7 +278,7 @@ class Driver:
 
         what = " and a soft body" if needs_body else ""
         waited = f"both arms in mode follow{what}"
-        await self.wait_for(ready, waited, 3 * WAIT_S, ArmsNotReadyError)
+        await self.wait_for(ready, waited, 3 * WAIT_S, error=ArmsNotReadyError)
 
     async def wait_for_table(
         self, scene: Scene, method: TableMethod, progress: Callable[[str], None]
@@ -321,6 +385,8 @@ class Driver:
         label: label of the image. shading: "flat" for a sharp outline in measurements, "soft" for
         figures. both_eyes: whether to wait for an image of each eye, instead of a single image.
         """
+        if "frame" not in self._subscribers:
+            self._subscribe("frame")
         self.show(
             Display(
                 correction=correction,
@@ -340,7 +406,13 @@ class Driver:
                 viewpoints.add(eye.viewpoint)
             return len(viewpoints) == (2 if both_eyes else 1)
 
-        await self.wait_for(received, f'the eye\'s image of "{label}"', IMAGE_WAIT_S)
+        await self.wait_for(
+            received,
+            f'the eye\'s image of "{label}"',
+            FRAME_WAIT_S,
+            max_frames=MAX_IMAGE_FRAMES,
+            max_seconds=MAX_IMAGE_WAIT_S,
+        )
         # Stop sending pixels in frames until the next image.
         self.show(Display(correction=correction, stereo="side_by_side"))
 
@@ -355,17 +427,6 @@ def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
     )
     has_body = scene.object.material is not None
     return has_body and method == "nonlinear_table" and parameters.friction_ratio == 0.0
-
-
-def _describe_load() -> str:
-    """Return a hint for timeout errors if the computer is overloaded, otherwise an empty text."""
-    load, cores = os.getloadavg()[0], os.cpu_count() or 1
-    if load <= MAX_LOAD_PER_CORE * cores:
-        return ""
-    return (
-        f"; this computer is overloaded (load {load:.0f} on {cores} cores); end other programs "
-        "and try again"
-    )
 
 
 def is_settled(arm: ArmState, target: SheetTarget) -> bool:

@@ -7,11 +7,13 @@ coroutine that controls the running graph by a `Driver`.
 from __future__ import annotations
 
 import asyncio
+import shlex
 import signal
+import time
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,15 +23,19 @@ from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.precompute import precompute_graph
-from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
+from flexsheet.messages.bag import FLUSH_PERIOD_S, BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import Correction, Display, FingerPath, Shading
+from flexsheet.messages.types import Correction, Display, FingerPath, Shading, TwinFinger
 from flexsheet.nodes.signals import handle_signals
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")
 DELIVERY_S = 0.3
+RECORD_WAIT_S = 60.0
+"""The maximum time to wait until the recorder has written an experiment to the bag."""
+
 SWITCH_SEED, SWITCH_INTERVAL_S = 1, (0.25, 0.4)
 """The random seed and the range (s) of the times between two switches of the projected image.
 
@@ -38,6 +44,7 @@ The times exceed the latency, and vary the phase between switches and exposures.
 
 Progress = Callable[[str], None]
 Procedure = Callable[[Driver, Scene], Awaitable[None]]
+Result = TypeVar("Result")
 
 
 def new_folder(name: str) -> Path:
@@ -126,10 +133,13 @@ def run_experiment(
     precompute_graph(plan, progress)
     try:
         asyncio.run(_await_interruptible(drive(plan, procedure, progress)))
-    except ExperimentError as error:
+    except (ExperimentError, NodeFailedError) as error:
         if bag is None or not bag.exists():
             raise
-        raise type(error)(f"{error}\nrecording until the error: {bag}") from error
+        raise type(error)(
+            f"{error}\nrecording until the error: {bag}\n"
+            f"to evaluate it: flexsheet bag report {shlex.quote(str(bag))}"
+        ) from error
     if bag is not None:
         progress("reading the bag")
 
@@ -244,3 +254,37 @@ def chain_procedures(*procedures: Procedure) -> Procedure:
             await each(driver, scene)
 
     return procedure
+
+
+def make_evaluation(
+    evaluate: Callable[[], Result | None], report: Callable[[Result], None], name: str
+) -> Procedure:
+    """Make a procedure that evaluates a finished experiment while the graph still runs.
+
+    evaluate: function that reads the bag and returns the result; None if the recorder has not yet
+    written the experiment. report: function that receives the result. name: name of the experiment
+    in the error text.
+    """
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        deadline_s = time.monotonic() + RECORD_WAIT_S
+        while (result := await asyncio.to_thread(evaluate)) is None:
+            if time.monotonic() > deadline_s:
+                raise driver.make_timeout_error(
+                    f"timeout: the recorder has not written {name} within {RECORD_WAIT_S:g} s"
+                )
+            await asyncio.sleep(FLUSH_PERIOD_S)
+        report(result)
+
+    return procedure
+
+
+def is_path_recorded(bag: Path, label: str) -> bool:
+    """Return whether a bag contains a finger path up to DELIVERY_S after its end."""
+    done_ns: int | None = None
+    for _, finger, header, _ in BagReader(bag, topics=["twin/finger"]):
+        if isinstance(finger, TwinFinger) and finger.path_label == label and finger.path_done:
+            done_ns = done_ns or header.source_ns
+            if header.source_ns >= done_ns + DELIVERY_S * 1e9:
+                return True
+    return False

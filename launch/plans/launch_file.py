@@ -100,8 +100,8 @@ class NodeSpec(StrictModel):
         default=0,
         ge=-20,
         le=19,
-        description="niceness of the process; values below 0 (higher priority) need root or "
-        "CAP_SYS_NICE",
+        description="niceness of the process, added to that of the launcher; values below 0 "
+        "(higher priority) need root or CAP_SYS_NICE",
     )
 
 

@@ -64,20 +64,20 @@ def _end_with_lifeline(lifeline: int) -> None:
 
 
 def apply_niceness() -> None:
-    """Set the niceness of this process and its session to the value in the node's configuration.
+    """Set the niceness of this process and its session from the node's configuration.
 
-    The value is added to the inherited niceness; a negative value gives higher priority. Raises
-    OSError if the system does not permit this niceness.
+    The configured value is added to the niceness of the launcher; a negative value gives higher
+    priority. Raises OSError if the system does not permit this niceness.
     """
     nice = int(os.environ.get(NICE_VARIABLE, "0"))
-    if nice == 0:
-        return
-    os.nice(nice)
-    if not AUTOGROUP.exists():
+    total = os.nice(nice)
+    # A user may lack the permission to give a negative niceness of the launcher to a session.
+    session_nice = total if total > 0 or nice < 0 else nice
+    if session_nice == 0 or not AUTOGROUP.exists():
         return
     for left in reversed(range(AUTOGROUP_TRIES)):
         try:
-            AUTOGROUP.write_text(str(nice))
+            AUTOGROUP.write_text(str(session_nice))
             return
         except BlockingIOError:
             if left == 0:

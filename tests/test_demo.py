@@ -1,0 +1,123 @@
+"""Test that the demo reports each experiment when it is finished, also if a later one fails."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+
+from flexsheet.launch.experiments import (
+    ExperimentError,
+    OverloadedError,
+    demo,
+    run,
+    stroke,
+)
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.running.runs import Run
+from flexsheet.messages.types import FingerPath
+from tests.commands import Command
+from tests.test_followed import LABEL, write_hand
+from tests.test_planner import SCENE
+
+DRIVER = Driver(load_graph(run.DEMO_FILE), Run("unused", Path("unused")))
+PATH = FingerPath(
+    label=LABEL,
+    times_s=np.array([1.0, 2.0]),
+    positions_world_m=np.zeros((2, 3)),
+    wander_m=0.0,
+    tremor_m=0.0,
+)
+ERRORS = {"mean": 0.0625, "std": 0.04}
+STROKE = {
+    "seconds": 10.0,
+    "delta_d_mm": ERRORS,
+    "delta_theta_deg": ERRORS,
+    "true_delta_d_mm": ERRORS,
+    "true_delta_theta_deg": ERRORS,
+}
+
+
+async def test_a_finished_path_is_reported_and_saved_while_the_graph_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "DELIVERY_S", 0.1)
+    monkeypatch.setattr(stroke, "read_recording", lambda bag: None)
+    monkeypatch.setattr(demo, "draw_latency", lambda recording, path: None)
+    bag, reported = write_hand(tmp_path / "demo.mcap"), list[demo.DemoResult]()
+    _, evaluate, *images = demo.make_demo_procedures(bag, print, reported.append, PATH)
+    await evaluate(DRIVER, SCENE)
+    assert len(images) == 4
+    (result,) = reported
+    assert result.followed == json.loads((tmp_path / "followed.json").read_text())
+    assert result.followed["path"] == LABEL
+
+
+def test_a_path_is_recorded_only_after_its_end(tmp_path: Path) -> None:
+    bag = write_hand(tmp_path / "a.mcap")  # ends 0.2 s after the path
+    assert not run.is_path_recorded(bag, LABEL)
+    assert demo.evaluate_path(bag, LABEL) is None
+    assert not run.is_path_recorded(bag, "another")
+
+
+async def test_an_evaluation_waits_for_the_recorder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "FLUSH_PERIOD_S", 0.0)
+    results: Iterator[str | None] = iter([None, None, "result"])
+    reported: list[str] = []
+    await run.make_evaluation(lambda: next(results), reported.append, "a path")(DRIVER, SCENE)
+    assert reported == ["result"]
+    monkeypatch.setattr(run, "RECORD_WAIT_S", -1.0)
+    with pytest.raises(ExperimentError, match="has not written a path within"):
+        await run.make_evaluation(lambda: None, reported.append, "a path")(DRIVER, SCENE)
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_results_before_an_error_are_printed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    flexsheet: Command,
+    options: tuple[str, ...],
+) -> None:
+    def fail_at_image(
+        file: Path, given: object, bag: Path, progress: Any, report: demo.Report, **_: object
+    ) -> NoReturn:
+        bag.touch()
+        report(demo.DemoResult(strokes=[STROKE], images=[tmp_path / "stroke.png"]))
+        raise OverloadedError("timeout: waited 40 s for the eye's image")
+
+    monkeypatch.setattr(demo, "run_demo", fail_at_image)
+    code, out, err = flexsheet("demo", "--output", tmp_path, *options)
+    assert code == 1
+    assert "waited 40 s" in err
+    if options:
+        assert json.loads(out)["strokes"] == [STROKE]
+    else:
+        assert "10 s" in out
+        assert "0.062" in out
+        assert "stroke.png" in err
+        assert "flexsheet explain overloaded" in err
+
+
+def test_an_error_names_the_bag_and_the_command_that_evaluates_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = tmp_path / "a bag.mcap"
+
+    async def fail(*_: object) -> None:
+        bag.touch()
+        raise OverloadedError("timeout")
+
+    monkeypatch.setattr(run, "precompute_graph", lambda plan, progress: None)
+    monkeypatch.setattr(run, "drive", fail)
+    with pytest.raises(OverloadedError) as failed:
+        run.run_experiment(run.DEMO_FILE, (), bag, run.chain_procedures(), print)
+    assert str(failed.value).splitlines() == [
+        "timeout",
+        f"recording until the error: {bag}",
+        f"to evaluate it: flexsheet bag report '{bag}'",
+    ]
