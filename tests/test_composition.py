@@ -184,6 +184,7 @@ def test_the_method_with_the_fewest_cases_out_of_range_is_preferred() -> None:
     assert name_methods(found.chosen) == {"soft-body": "deep"}
     assert not found.accepted
     assert "soft-body deep: 10% of the scene's cases are out of range" in found.explain()
+    assert found.unmet.endswith("The scene exceeds the range of the method: soft-body.")
 
 
 def test_predictions_learn_only_what_the_tables_lack() -> None:

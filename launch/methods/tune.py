@@ -621,9 +621,7 @@ def _draft_path(target: Path) -> Path:
     return target.with_name(f".{target.stem}.{os.getpid()}.yaml")
 
 
-def write_choices(
-    source: Path, target: Path, choices: Sequence[Choice], unmet: str = ""
-) -> None:
+def write_choices(source: Path, target: Path, choices: Sequence[Choice], unmet: str = "") -> None:
     """Write the choices atomically into a scene file or into a copy of it.
 
     source: scene file. target: file to write; if it is a symbolic link, the file that it points to
