@@ -148,9 +148,18 @@ def test_a_drag_beside_the_object_stays_on_its_touchable_surface(scene: Scene) -
             point = path.positions_world_m[0]
             command = contact.step(apply(sheet, point), np.zeros(3), sheet)
             assert command.reason == "ok"
-            assert command.push_depth_m < 0.004 + 5e-4
+            assert command.push_depth_m < 0.004 + 1e-3
         assert abs(point[0]) < 0.5 * geometry.length_m
         assert depth_m(scene, point) == pytest.approx(0.004, abs=2e-4)
+
+
+def test_a_drag_beyond_a_limit_of_one_direction_keeps_the_other_coordinate() -> None:
+    picker, forward = SurfacePicker(load_cylinder()), np.array([0.0, 0.0, -1.0])
+    above = picker.pick(np.array([0.03, 0.2, 0.6]), forward, 0.0)
+    beside = picker.pick(np.array([0.12, 0.01, 0.6]), forward, 0.0)
+    assert above[0] == pytest.approx(0.03, abs=2e-3)
+    assert beside[1] == pytest.approx(0.01, abs=2e-3)
+    assert beside[0] == pytest.approx(0.06 - 0.002, abs=1e-3), "the margin of the rim"
 
 
 def test_a_push_deeper_than_the_working_range_is_refused(scene: Scene) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
@@ -21,8 +22,9 @@ HOVER_M = 0.03
 RIM_MARGIN_M = 0.002
 """The minimum distance of a selected point from the rim of the touchable surface."""
 
-RIM_SEARCH_STEPS = 8
-"""The number of halvings of the interval in which the last touchable point is searched."""
+SEARCH_POINTS, SEARCH_ROUNDS = 17, 2
+"""The number of points on a line that are tested for the last touchable point, and the number of
+rounds. Each round tests the interval that the previous round found."""
 
 
 class SurfacePicker:
@@ -75,32 +77,42 @@ class SurfacePicker:
         return self._within(apply(self._world_from_object, inside))
 
     def _find_touchable(self, near: Floats) -> Nearest:
-        """Return the touchable surface point within the working range that is nearest to `near`.
+        """Return the touchable surface point nearest to `near`, or a touchable point close to it.
 
-        near: point (3,) in the object's frame, m. The search for the last touchable point follows
-        the straight line from the front of the object, and projects each point onto the surface.
+        near: point (3,) in the object's frame, m. The search starts at the front of the object. It
+        follows the straight line to the surface point nearest to `near`, and then the remaining
+        distance along the world's x and y axes.
         """
         found = self._shape.closest(near)
-        if self._is_touchable(found):
-            return found
-        best, across = self._shape.closest(self._front_m), found.point - self._front_m
-        low, high = 0.0, 1.0
-        for _ in range(RIM_SEARCH_STEPS):
-            middle = 0.5 * (low + high)
-            tried = self._shape.closest(self._front_m + middle * across)
-            if self._is_touchable(tried):
-                best, low = tried, middle
-            else:
-                high = middle
-        return best
-
-    def _is_touchable(self, found: Nearest) -> bool:
-        if found.on_edge or found.normal @ self._towards_user < self._min_cos_tilt:
-            return False
         outwards = found.point - self._front_m
         length_m = max(float(np.linalg.norm(outwards)), RIM_MARGIN_M)
-        beyond = found.point + RIM_MARGIN_M / length_m * outwards
-        return not self._shape.closest(beyond).on_edge
+        beyond = self._shape.closest(found.point + RIM_MARGIN_M / length_m * outwards)
+        if self._is_touchable(found) and not beyond.on_edge:
+            return found
+        best = self._advance(self._front_m, outwards)
+        for axis in self._object_from_world[:3, :2].T:
+            best = self._advance(best.point, ((found.point - best.point) @ axis) * axis)
+        return best
+
+    def _advance(self, start: Floats, displacement: Floats) -> Nearest:
+        """Return the last touchable surface point on the path from `start` along `displacement`.
+
+        start, displacement: touchable point (3,) and displacement (3,), m, in the object's frame.
+        Points on the straight path are projected onto the surface.
+        """
+        margin = RIM_MARGIN_M / max(float(np.linalg.norm(displacement)), RIM_MARGIN_M)
+        low, high = 0.0, 1.0 + margin
+        for _ in range(SEARCH_ROUNDS):
+            tried = np.linspace(low, high, SEARCH_POINTS)
+            found = self._shape.closest(start + tried[:, None] * displacement)
+            touchable = int(np.argmin(np.append(self._is_touchable(found), False)))
+            low = float(tried[max(touchable - 1, 0)])
+            high = float(tried[min(touchable, SEARCH_POINTS - 1)])
+        return self._shape.closest(start + max(low - margin, 0.0) * displacement)
+
+    def _is_touchable(self, found: Nearest) -> NDArray[np.bool_]:
+        tilt_is_small = found.normal @ self._towards_user >= self._min_cos_tilt
+        return np.asarray(~found.on_edge & tilt_is_small)
 
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
         """Return the next point (3,), in m, on the path of the finger to the target.
