@@ -401,7 +401,7 @@ class Subscriber:
         self.on_handshake_failed = on_handshake_failed or on_problem
         self._on_message, self._message_filter, self._plan = on_message, message_filter, plan
         self._latched = topic.delivery is Delivery.LATCHED
-        latest_only = topic.delivery is Delivery.LATEST and not raw
+        self._latest_only = latest_only = topic.delivery is Delivery.LATEST and not raw
         self._writers_seen: dict[str, _Writer] = {}
         self._reported_causes: set[str] = set()
         self._report_gaps_from = 1
@@ -552,9 +552,13 @@ class Subscriber:
             self.on_problem(f'topic "{self.topic.name}": a message was refused: {error}')
 
     def _count_gap(self, lost: int, writer: str) -> None:
+        if self._latest_only:
+            # The short queue was full, and a newer message replaces the missing ones.
+            self.counts.dropped += lost
+            return
         self.counts.gaps += lost
-        latest_only = self.topic.delivery is Delivery.LATEST
-        if not latest_only and self.counts.gaps >= self._report_gaps_from:
+        delivers_newest = self.topic.delivery is Delivery.LATEST
+        if not delivers_newest and self.counts.gaps >= self._report_gaps_from:
             self._report_gaps_from = 2 * self.counts.gaps
             self.on_problem(
                 f'topic "{self.topic.name}": {lost} messages of {writer} were lost, '

@@ -17,7 +17,7 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.types import Arming, EStop
 from flexsheet.nodes.arm_bridge.control import MAX_ARMING_AGE_S, MAX_WAIT_FOR_OTHER_S, RELAX_DELAY_S
 from flexsheet.nodes.arm_bridge.goal import Goal
-from flexsheet.nodes.arm_bridge.link import ArmFault, ArmStatus, Floats
+from flexsheet.nodes.arm_bridge.link import ArmFault, ArmSilentError, ArmStatus, Floats
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from tests.arm_states import arm_state
 from tests.examples import examples, long_except
@@ -235,12 +235,15 @@ class CountingLink:
 
     def __init__(self) -> None:
         self.modes: list[str] = []
+        self.fails = False
 
     def due(self, now_ns: int) -> bool:
         return True
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
         self.modes.append(mode)
+        if self.fails:
+            raise ArmSilentError("no answer")
         return ArmStatus(np.zeros(6), ())
 
     def close(self) -> None:
@@ -277,6 +280,35 @@ async def test_an_arm_that_is_not_enabled_gets_fewer_commands_until_an_event() -
     await node.step("estop", EStop(engaged=True, reason="button"), header())
     assert await asked_within_a_second() >= 138
     assert set(link.modes) <= {"idle", "stop"}
+    await node.close()
+
+
+async def test_failed_exchanges_are_counted_from_the_first_answer_on() -> None:
+    """Earlier, the connection attempts before the start of the arm counted as failed exchanges."""
+    clock, link = VirtualClock(10**9, clock_id="here"), CountingLink()
+    node = ArmBridge(
+        ArmBridgeParameters(side="left"),
+        name="bridge",
+        clock=clock,
+        send=lambda topic, message, header: None,
+        topics={"arm": "arm_left", "other_arm": "arm_right"},
+    )
+    await node.setup()
+    node._link = link
+
+    async def cycle(*, fails: bool) -> str:
+        link.fails = fails
+        asked = len(link.modes)
+        while len(link.modes) == asked:
+            clock.move_to(clock.now_ns() + round(1e9 / 140))
+            await node.cycle()
+        return node.note
+
+    stamp = clock.now_ns()
+    await node.step("scene", load_scene(SCENE_FILE), Header(1, stamp, stamp, "here", "tools", 1))
+    assert "exchange" not in await cycle(fails=True)
+    assert "exchange" not in await cycle(fails=False)
+    assert "failed exchanges with the controller: 1" in await cycle(fails=True)
     await node.close()
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexsheet.launch.commands.session import describe_node, describe_output
+from flexsheet.launch.commands.session import describe_node, describe_output, explain_counts
 from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import runs
@@ -349,6 +349,13 @@ def test_status_distinguishes_skipped_from_lost_messages() -> None:
     node = load_graph(DEMO_FILE).nodes["renderer"]
     row = describe_node(node, make_status("renderer", inputs=(port,)))
     assert (row["skipped"], row["lost"]) == (4, 3)
+    skipped, lost = explain_counts([row])
+    assert skipped.startswith("skipped: ")
+    assert "This is normal" in skipped
+    assert lost.startswith("lost: ")
+    assert "`flexsheet logs renderer`" in lost
+    assert explain_counts([{**row, "lost": 0}]) == [skipped]
+    assert explain_counts([{**row, "skipped": 0, "lost": 0}, {**row, "lost": None}]) == [skipped]
 
 
 def test_status_shows_no_rate_that_has_no_meaning() -> None:

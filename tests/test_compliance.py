@@ -281,6 +281,8 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     assert shown.exit_code == code
     assert "stretch" in shown.stdout
     assert "computing the rendered force" in shown.stderr
+    assert "rendering error" in shown.stdout
+    assert "error of this model relative to the reference" in " ".join(shown.stderr.split())
 
 
 def test_progress_is_reported_again_when_another_computation_starts() -> None:

@@ -132,6 +132,7 @@ def test_a_tolerance_that_no_method_meets_is_named_with_its_cost() -> None:
     found = compose(STAGES, LIMITS, graph, margin=0.0)
     assert not found.accepted
     assert set(found.last.exceeded) == {TO_ARM}
+    assert found.unmet == "Not met at the 95 % value: exposure to arm."
     verdict, reason = found.explain()
     assert verdict.startswith("no tested configuration meets all tolerances")
     assert "exposure_to_arm_ms: 15.5, tolerance 15; methods add marker 1" in reason
@@ -183,6 +184,7 @@ def test_the_method_with_the_fewest_cases_out_of_range_is_preferred() -> None:
     assert name_methods(found.chosen) == {"soft-body": "deep"}
     assert not found.accepted
     assert "soft-body deep: 10% of the scene's cases are out of range" in found.explain()
+    assert found.unmet.endswith("The scene exceeds the range of the method: soft-body.")
 
 
 def test_predictions_learn_only_what_the_tables_lack() -> None:

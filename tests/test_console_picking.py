@@ -13,13 +13,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Cylinder, Scene
 from flexsheet.messages.types import (
     FingerPath,
 )
 from flexsheet.nodes.console.controller import SceneController
 from flexsheet.nodes.console.finger import FingerController, FingerIntent, Ray
 from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner.contact_state import ContactLimits, ContactStateMachine
 from tests.plans import scene_with
 from tests.scenes import load_cylinder
 from tests.waiting import DEADLINE_S
@@ -44,9 +47,8 @@ def test_the_mouse_means_a_point_below_the_surface_or_beside_it(scene: Scene) ->
     np.testing.assert_allclose(picker.pick(eye, forward, 0.0), [0.0, 0.0, 0.0], atol=2e-4)
     np.testing.assert_allclose(picker.pick(eye, forward, 0.01), [0.0, 0.0, -0.01], atol=2e-4)
     beside = picker.pick(eye, np.array([0.0, 0.3, -0.6]), 0.01)
-    assert beside[1] > 0.05
-    assert (beside >= scene.finger.volume_min_m).all()
-    assert (beside <= scene.finger.volume_max_m).all()
+    assert beside[1] > 0.02
+    assert depth_m(scene, beside) == pytest.approx(0.01, abs=2e-4)
     grazing = np.array([0.0, 0.04, -0.6 - scene.object.geometry.radius_m])  # type: ignore[union-attr]  # a cylinder
     for towards in (forward, grazing):
         hover = picker.pick(eye, towards, -HOVER_M)
@@ -74,7 +76,8 @@ def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> No
     centre = scene.object.world_from_object.position_m
     depths = radius - np.linalg.norm(ways[:, 1:] - centre[1:], axis=1)
     assert depths.max() < 0.003 + 2e-4
-    assert ways[-1, 1] == pytest.approx(0.04, abs=2e-3)
+    highest_m = (radius - 0.003) * np.sin(scene.working_range.tilt_rad)
+    assert ways[-1, 1] == pytest.approx(highest_m, abs=2e-3), "the limit of the tilt"
     assert np.linalg.norm(np.diff(ways, axis=0), axis=1).max() < 0.008
     rested = len(sent)
     finger.advance(0.05, None)
@@ -101,6 +104,73 @@ def depth_m(scene: Scene, point: Floats) -> float:
     """Return the depth (m) of a point below the side of the cylinder."""
     away = (point - scene.object.world_from_object.position_m)[1:]
     return float(scene.object.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
+
+
+def test_a_drag_beside_the_object_stays_on_its_touchable_surface(scene: Scene) -> None:
+    """Earlier, a drag beside the end of the cylinder moved the finger behind the sheet."""
+    sent: list[FingerPath] = []
+    finger = FingerController(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
+    finger.use(SurfacePicker(scene))
+    geometry, solid = scene.object.geometry, scene.object
+    assert isinstance(geometry, Cylinder)
+    towards_user = inverse(pose_matrix(solid.world_from_object))[:3, 2]
+    max_depth_m = scene.working_range.push_depth_m
+    contact = ContactStateMachine(
+        make_shape(dict(geometry)),
+        inverse(pose_matrix(solid.world_from_object))[:3, :3],
+        ContactLimits(
+            front=towards_user,
+            max_tilt_rad=scene.working_range.tilt_rad + 0.02,
+            max_spin_rad=0.3,
+            half_width_m=geometry.length_m,
+            half_height_m=geometry.length_m,
+            contact_on_m=0.0005,
+            contact_off_m=0.003,
+            max_depth_m=1.4 * max_depth_m,
+        ),
+    )
+    sheet = inverse(pose_matrix(solid.world_from_object))
+    eye, side_eye = np.array([0.0, 0.0, 0.6]), np.array([0.5, 0.2, 0.4])
+    for origin, x, y in (
+        (eye, 0.06, 0.0),
+        (eye, 0.094, 0.0),
+        (eye, 0.15, 0.01),
+        (eye, 0.0, 0.0),
+        (eye, -0.2, 0.0),
+        (side_eye, 0.1, 0.0),
+        (side_eye, 0.02, -0.1),
+        (eye, 0.0, 0.12),
+    ):
+        finger.touch(origin, np.array([x, y, 0.0]) - origin)
+        begun = len(sent)
+        moved(finger, sent)
+        for path in sent[begun:]:
+            point = path.positions_world_m[0]
+            command = contact.step(apply(sheet, point), np.zeros(3), sheet)
+            assert command.reason == "ok"
+            assert command.push_depth_m < 0.004 + 1e-3
+        assert abs(point[0]) < 0.5 * geometry.length_m
+        assert depth_m(scene, point) == pytest.approx(0.004, abs=2e-4)
+
+
+def test_a_drag_beyond_a_limit_of_one_direction_keeps_the_other_coordinate() -> None:
+    picker, forward = SurfacePicker(load_cylinder()), np.array([0.0, 0.0, -1.0])
+    above = picker.pick(np.array([0.03, 0.2, 0.6]), forward, 0.0)
+    beside = picker.pick(np.array([0.12, 0.01, 0.6]), forward, 0.0)
+    assert above[0] == pytest.approx(0.03, abs=2e-3)
+    assert beside[1] == pytest.approx(0.01, abs=2e-3)
+    assert beside[0] == pytest.approx(0.06 - 0.002, abs=1e-3), "the margin of the rim"
+
+
+def test_a_push_deeper_than_the_working_range_is_refused(scene: Scene) -> None:
+    picker = SurfacePicker(scene)
+    eye, forward = np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, -1.0])
+    np.testing.assert_allclose(picker.pick(eye, forward, 0.2), [0.0, 0.0, -0.05], atol=2e-4)
+    finger = FingerController(lambda message: None, speed_m_per_s=0.1)
+    finger.use(picker)
+    with pytest.raises(ValueError, match="60 mm is deeper than the working range of the scene, 50"):
+        finger.push(0.06)
+    assert not finger.commanded
 
 
 def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:

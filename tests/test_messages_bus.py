@@ -210,6 +210,11 @@ async def test_latest_hands_over_the_newest_and_counts_the_rest(connections: Con
     assert receiver.counts.gaps == 0
     message, _ = receiver.inbox[-1]
     assert (message.left == (start + 39) % 250).all()
+    # A full queue skips messages too. Earlier, these messages counted as lost.
+    receiver.counts.dropped = 0
+    publisher.send(pictures(0), header(start + 50))
+    await until(lambda: receiver.sequences[-1] == start + 50)
+    assert (receiver.counts.dropped, receiver.counts.gaps) == (10, 0)
     assert not message.left.flags.writeable
 
 

@@ -237,9 +237,11 @@ def test_a_composed_choice_is_explained_without_the_tolerance_of_its_family() ->
         today="2026-01-02",
         machine="a machine",
         commit=None,
-        unmet=["sheet_mm", "force_percent"],
+        unmet="Not met at the 95 % value: sheet, force.",
     )
-    assert "; a machine; INSUFFICIENT: sheet_mm, force_percent.\n" in text
+    comment = "; a machine.\n# Not met at the 95 % value: sheet, force. See docs/tune.md.\nmethods:"
+    assert comment in text
+    assert put(text, GOOD).count("#") == 2, "a new comment replaces both lines"
     assert "marker: dear  # 1 ms, error 2.5 mm\n" in text
 
 
@@ -256,7 +258,7 @@ def test_choices_are_added_to_a_file_and_all_else_is_left_as_it_was() -> None:
     assert text.startswith(FILE)
     assert "# Chosen by `flexsheet tune` on 2026-01-02; a machine; code 0000000000.\n" in text
     assert "  marker: cheap  # 10 µs, error 0.1, tolerance 1 mm\n" in text
-    assert "  tracking: cheap  # INSUFFICIENT: 10 µs" in text
+    assert "  tracking: cheap  # 10 µs, error 2, tolerance 1 mm, not met in 1 of 1 cases\n" in text
     assert YAML(typ="safe").load(text)["methods"] == {"marker": "cheap", "tracking": "cheap"}
 
 
@@ -265,7 +267,7 @@ def test_choices_are_written_over_and_other_families_stay() -> None:
     again = put(text, choice_of([point("dear", 0.2)]))
     assert again.count("methods:") == again.count("Chosen by") == 1
     assert YAML(typ="safe").load(again)["methods"] == {"marker": "dear", "tracking": "cheap"}
-    assert "INSUFFICIENT" in again  # of the one that was not tuned again
+    assert "not met in 1 of 1 cases" in again  # of the one that was not tuned again
     assert again.startswith(FILE)
     assert again.endswith("# behind\nlast: 2\n")
     assert put(again, choice_of([point("dear", 0.2)])) == again
@@ -466,8 +468,9 @@ def test_tuned_scenes_report_whether_they_are_sufficient(name: str, missed: bool
     text = (SCENES / f"{name}.yaml").read_text()
     methods = Methods.model_validate(YAML(typ="safe").load(text)["methods"])
     assert methods.tracking is not None
-    reported = text.partition("INSUFFICIENT: ")[2].partition(".\n")[0].split(", ")
-    assert bool({*reported} - {"", "exposure_to_arm_ms", "exposure_to_light_ms"}) == missed
+    reported = text.partition("95 % value: ")[2].partition(".")[0].split(", ")
+    late = {"", "exposure to arm", "exposure to light"}
+    assert (bool({*reported} - late) or ", not met in" in text) == missed
     families = dict(methods)
     del families["compliance"]
     assert (None not in families.values()) or missed

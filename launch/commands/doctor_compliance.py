@@ -41,9 +41,9 @@ def compliance(
 ) -> None:
     """Check that the sheet can feel as soft as the virtual object of a scene.
 
-    The command compares the force of the object with the rendered force, for pushes at the centre
-    up to the maximum depth of the scene. It also checks that hand and sheet cannot oscillate at the
-    given delay. The exit code is 1 if a check fails.
+    The command compares the force of the object's model with the rendered force, for pushes at the
+    centre up to the maximum depth of the scene. It also checks that hand and sheet cannot oscillate
+    at the given delay. The exit code is 1 if a check fails.
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
@@ -72,14 +72,21 @@ def compliance(
             rows,
             {
                 "depth, mm": ("depth_mm", ".0f"),
-                "object, N": ("target_n", ".3f"),
+                "model, N": ("target_n", ".3f"),
                 "rendered, N": ("rendered_n", ".3f"),
-                "error": ("error", "+.1%"),
+                "rendering error": ("error", "+.1%"),
                 "normal offset, mm": ("normal_offset_mm", ".2f"),
             },
         )
         figures = {name: one for name, one in result.items() if name not in ("rows", "note")}
         print_result(figures, as_json=False)
-        words.print(result["note"] or "the error is within the tolerance")
+        words.print(
+            result["note"]
+            or "the rendering error relative to the model of the object is within the tolerance"
+        )
+        words.print(
+            "`flexsheet status` states the error of this model relative to the reference (node "
+            "fem_solver)"
+        )
     if result["note"]:
         raise typer.Exit(FAILED)

@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -58,8 +58,7 @@ NodeArgument = Annotated[
 def status(run: options.RunOption = None, as_json: options.JsonOption = False) -> None:
     """Show the nodes of the running graph with their message rates, lost messages and notes.
 
-    Skipped messages are older messages that a slow node does not read. Lost messages were lost in
-    transit or refused.
+    If messages were skipped or lost, a line under the table explains whether this matters.
 
     The command also prints the problems that the self-checks of the nodes suspect. The exit code is
     1 if a problem is suspected, or if a node does not report its status.
@@ -91,6 +90,8 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
             for name in ("inputs", "outputs", "errors"):
                 del row[name]
         print_rows(rows, as_json=False)
+        for line in explain_counts(rows):
+            words.print(line)
         for host, reason in estops.items():
             words.print(f"e-stop on {host}: {reason}", style="red")
         for one in suspicions:
@@ -141,6 +142,22 @@ def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
         "errors": status.errors,
         "note": status.last_error if status.state == "degraded" else status.note,
     }
+
+
+def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return an explanation of each count that is not zero in the table of `flexsheet status`."""
+    lines = []
+    if any(row["skipped"] for row in rows):
+        lines.append(
+            "skipped: newer messages replaced these messages before the node read them. This is "
+            "normal, unless the number grows all the time: then the computer is too busy."
+        )
+    if lossy := [row["node"] for row in rows if row["lost"]]:
+        lines.append(
+            "lost: these messages were lost in transit or refused. This must not happen: see "
+            f"`flexsheet logs {lossy[0]}`."
+        )
+    return lines
 
 
 def describe_output(port: dict[str, Any]) -> str:

@@ -138,7 +138,7 @@ def tune(
     else:
         _print_choices(choices)
     if target is not None:
-        unmet = () if composition is None else composition.unmet
+        unmet = "" if composition is None else composition.unmet
         tune.write_choices(scene_file, target, choices, unmet)
     words.print("no file written (--dry-run)" if target is None else f"written: {target}")
     if not met:

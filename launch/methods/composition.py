@@ -47,6 +47,11 @@ class SystemMetric(StrEnum):
     TO_ARM = "exposure_to_arm_ms"
     TO_LIGHT = "exposure_to_light_ms"
 
+    @property
+    def label(self) -> str:
+        """Return the name of the metric without its unit, as text."""
+        return self.value.rpartition("_")[0].replace("_", " ")
+
 
 DELAYS = frozenset({SystemMetric.TO_ARM, SystemMetric.TO_LIGHT})
 
@@ -211,11 +216,17 @@ class Composition:
         return not self.last.exceeded and all(one.in_range for one in self.chosen.values())
 
     @property
-    def unmet(self) -> list[str]:
-        """Return the metrics that exceed their tolerance, and the stages with a method out of
-        range."""
-        stages = [stage for stage, option in self.chosen.items() if not option.in_range]
-        return [*self.last.exceeded, *(f"{stage} out of range" for stage in stages)]
+    def unmet(self) -> str:
+        """Return a sentence for the metrics that exceed their tolerance, and a sentence for the
+        stages whose method is out of range; an empty text if there are none."""
+        exceeded = ", ".join(metric.label for metric in self.last.exceeded)
+        stages = ", ".join(stage for stage, option in self.chosen.items() if not option.in_range)
+        sentences = []
+        if exceeded:
+            sentences.append(f"Not met at the 95 % value: {exceeded}.")
+        if stages:
+            sentences.append(f"The scene exceeds the range of the method: {stages}.")
+        return " ".join(sentences)
 
     def report(self) -> dict[str, Any]:
         """Return the result in the format of `flexsheet tune --json`."""

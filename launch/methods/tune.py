@@ -440,6 +440,8 @@ def _is_selected(methods: Mapping[str, Setting], trial: Trial) -> bool:
 
 
 METHODS = "methods"
+HEAD, UNMET_END = "# Chosen by `flexsheet tune`", "See docs/tune.md."
+"""The start of the generated comment, and the end of its line about unmet tolerances."""
 
 
 def insert_choices(
@@ -449,22 +451,22 @@ def insert_choices(
     today: str,
     machine: str,
     commit: str | None,
-    unmet: Sequence[str] = (),
+    unmet: str = "",
 ) -> str:
     """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
     All other text is unchanged, including the methods of other method families. If `methods` is a
     mapping on one line, it is expanded to several lines. today, machine, commit: values for the
-    generated comment. unmet: system metrics that exceed their tolerance, and stages out of their
-    range, for the comment.
+    generated comment. unmet: sentences about tolerances that are not met, for the comment.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
     block = _find_block(text, lines)
     chosen = {choice.key: choice for choice in choices}
     code = "" if commit is None else f"; code {commit[:10]}"
-    missed = f"; INSUFFICIENT: {', '.join(unmet)}" if unmet else ""
-    head = f"# Chosen by `flexsheet tune` on {today}; {machine}{code}{missed}.{ending}"
+    head = f"{HEAD} on {today}; {machine}{code}.{ending}"
+    if unmet:
+        head += f"# {unmet} {UNMET_END}{ending}"
     new = [head, block.header or f"{METHODS}:{ending}"]
     for key, own in block.parts:
         if key in chosen:
@@ -491,8 +493,7 @@ def _make_line(choice: Choice, indent: str) -> str:
     comment = f"{took}, error {_format(choice.chosen.error)}"
     comment += f" {choice.unit}" if choice.composed else f", tolerance {allowed}"
     if not choice.met:
-        missed = f"outside in {choice.chosen.missed} of {choice.chosen.cases} cases"
-        comment = f"INSUFFICIENT: {comment}; {missed}"
+        comment += f", not met in {choice.chosen.missed} of {choice.chosen.cases} cases"
     return f"{indent}{choice.key}: {_format_flow(setting)}  # {comment}"
 
 
@@ -523,8 +524,10 @@ def _find_block(text: str, lines: Sequence[str]) -> _Block:
     end = min(later, default=len(lines))
     while end > start + 1 and (not lines[end - 1].strip() or lines[end - 1].startswith("#")):
         end -= 1
-    if start > 0 and lines[start - 1].startswith("# Chosen by `flexsheet tune`"):
-        start -= 1
+    unmet = start > 1 and lines[start - 1].rstrip().endswith(UNMET_END)
+    head = start - 2 if unmet else start - 1
+    if head >= 0 and lines[head].startswith(HEAD):
+        start = head
     inner = tree[METHODS]
     if not isinstance(inner, CommentedMap):
         return _Block(start, end, parts=(("", list(lines[first + 1 : end])),))
@@ -618,9 +621,7 @@ def _draft_path(target: Path) -> Path:
     return target.with_name(f".{target.stem}.{os.getpid()}.yaml")
 
 
-def write_choices(
-    source: Path, target: Path, choices: Sequence[Choice], unmet: Sequence[str] = ()
-) -> None:
+def write_choices(source: Path, target: Path, choices: Sequence[Choice], unmet: str = "") -> None:
     """Write the choices atomically into a scene file or into a copy of it.
 
     source: scene file. target: file to write; if it is a symbolic link, the file that it points to

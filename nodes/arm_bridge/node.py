@@ -177,7 +177,10 @@ class ArmBridge(Node):
             await self._exchange(geometry, other, step_s)
         control = self._control
         doing = f"{control.mode} {control.reason}".rstrip()
-        self.note = f"{doing}; {self._failures} failed exchanges"
+        self.note = doing
+        if self._failures:
+            self.note += f"; failed exchanges with the controller: {self._failures}"
+            self.note += " (two in a row stop the arm)"
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
             state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)
@@ -205,7 +208,8 @@ class ArmBridge(Node):
         try:
             status = await self._link.exchange(mode=mode, joints_rad=joints_rad, now_ns=now_ns)
         except ArmLinkError as error:
-            self._failures += 1
+            if control.last_measured_rad is not None:  # The arm has started.
+                self._failures += 1
             if control.on_exchange_failed(str(error), silent=isinstance(error, ArmSilentError)):
                 self.log.warning("the connection to the arm is lost", problem=str(error))
             return

@@ -71,6 +71,7 @@ class FingerIntent:
     def target_m(self, picker: SurfacePicker) -> Floats:
         """Return the requested position (3,), in m, of the fingertip in the world frame.
 
+        The position is limited to the touchable surface and the working range of the scene.
         picker: selector of points on the object.
         """
         origin, direction = np.array(self.position.origin_m), np.array(self.position.direction)
@@ -121,7 +122,16 @@ class FingerController:
         self._request(position=Ray.from_front(x_m, y_m))
 
     def push(self, depth_m: float) -> None:
-        """Push to a depth below the surface at the requested position."""
+        """Push to a depth below the surface at the requested position.
+
+        Raises ValueError if the depth exceeds the scene's working range.
+        """
+        if self._picker is not None and self._picker.max_depth_m < depth_m < np.inf:
+            raise ValueError(
+                f"Push: {1e3 * depth_m:g} mm is deeper than the working range of the scene, "
+                f"{1e3 * self._picker.max_depth_m:g} mm; choose a smaller depth, or increase "
+                "`working_range.push_depth_m` of the scene"
+            )
         self._request(depth_m=depth_m, lifted=False)
 
     def lift_or_lower(self) -> None:

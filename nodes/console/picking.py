@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
-from flexsheet.nodes.models.shapes import Shape, make_shape
+from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape
 
 MAX_RAY_M = 3.0
 SURFACE_TOLERANCE_M = 1e-4
@@ -18,24 +19,40 @@ MIN_STEP_RATIO = 0.01
 HOVER_M = 0.03
 """The height of a lifted finger above the object's surface."""
 
+RIM_MARGIN_M = 0.002
+"""The minimum distance of a selected point from the rim of the touchable surface."""
+
+SEARCH_POINTS, SEARCH_ROUNDS = 17, 2
+"""The number of points on a line that are tested for the last touchable point, and the number of
+rounds. Each round tests the interval that the previous round found."""
+
 
 class SurfacePicker:
-    """A selector of points on the object of a scene. Its construction takes a second for a mesh."""
+    """A selector of points on the object of a scene. Its construction takes a second for a mesh.
+
+    Only points within the scene's working range are selected: the tilt and the depth are limited,
+    and a point beyond the rim of the touchable surface is replaced by a point before the rim.
+    max_depth_m: maximum push depth of the working range.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self._world_from_object = pose_matrix(scene.object.world_from_object)
         self._object_from_world = inverse(self._world_from_object)
         self._shape: Shape = make_shape(dict(scene.object.geometry))
         self._low, self._high = scene.finger.volume_min_m, scene.finger.volume_max_m
+        self.max_depth_m = scene.working_range.push_depth_m
+        self._min_cos_tilt = np.cos(scene.working_range.tilt_rad)
+        self._towards_user = self._object_from_world[:3, 2]
+        self._front_m = self._shape.closest(10.0 * self._towards_user).point
 
     def pick(self, origin: Floats, direction: Floats, depth_m: float) -> Floats:
         """Return the fingertip position (3,), in m, that a ray from the viewer's eye selects.
 
         origin, direction: origin (3,), m, and direction (3,) of the ray in the world frame; the
             direction is not zero.
-        If the ray meets the object, the position is `depth_m` below the surface along the normal. A
-        negative depth is above the surface. If the ray misses the object, the position is the point
-        of the ray that is nearest to the object, but not deeper than `depth_m`.
+        The position is `depth_m` below the surface along the normal, at the point where the ray
+        meets the object, or else at the surface point nearest to the ray. A negative depth is
+        above the surface. The point and the depth are limited to the working range.
         """
         direction = direction / np.linalg.norm(direction)
         travelled, nearest_m, nearest = 0.0, np.inf, origin
@@ -44,24 +61,58 @@ class SurfacePicker:
             away_m = float(self._shape.signed_distance(apply(self._object_from_world, point)))
             if away_m < nearest_m:
                 nearest_m, nearest = away_m, point
-            if away_m < SURFACE_TOLERANCE_M:
-                return self.offset_point(point, depth_m)
             travelled += away_m
-            if travelled > MAX_RAY_M:
+            if away_m < SURFACE_TOLERANCE_M or travelled > MAX_RAY_M:
                 break
-        return (
-            self.offset_point(nearest, depth_m) if nearest_m < -depth_m else self._within(nearest)
-        )
+        return self.offset_point(nearest, depth_m)
 
     def offset_point(self, near: Floats, depth_m: float) -> Floats:
-        """Return the point (3,), in m, at a depth below the surface point nearest to `near`.
+        """Return the point (3,), in m, at a depth below the touchable surface nearest to `near`.
 
         near: point (3,), m.
         A negative depth results in a point above the surface.
         """
-        found = self._shape.closest(apply(self._object_from_world, near))
-        inside = found.point - depth_m * found.normal
+        found = self._find_touchable(apply(self._object_from_world, near))
+        inside = found.point - min(depth_m, self.max_depth_m) * found.normal
         return self._within(apply(self._world_from_object, inside))
+
+    def _find_touchable(self, near: Floats) -> Nearest:
+        """Return the touchable surface point nearest to `near`, or a touchable point close to it.
+
+        near: point (3,) in the object's frame, m. The search starts at the front of the object. It
+        follows the straight line to the surface point nearest to `near`, and then the remaining
+        distance along the world's x and y axes.
+        """
+        found = self._shape.closest(near)
+        outwards = found.point - self._front_m
+        length_m = max(float(np.linalg.norm(outwards)), RIM_MARGIN_M)
+        beyond = self._shape.closest(found.point + RIM_MARGIN_M / length_m * outwards)
+        if self._is_touchable(found) and not beyond.on_edge:
+            return found
+        best = self._advance(self._front_m, outwards)
+        for axis in self._object_from_world[:3, :2].T:
+            best = self._advance(best.point, ((found.point - best.point) @ axis) * axis)
+        return best
+
+    def _advance(self, start: Floats, displacement: Floats) -> Nearest:
+        """Return the last touchable surface point on the path from `start` along `displacement`.
+
+        start, displacement: touchable point (3,) and displacement (3,), m, in the object's frame.
+        Points on the straight path are projected onto the surface.
+        """
+        margin = RIM_MARGIN_M / max(float(np.linalg.norm(displacement)), RIM_MARGIN_M)
+        low, high = 0.0, 1.0 + margin
+        for _ in range(SEARCH_ROUNDS):
+            tried = np.linspace(low, high, SEARCH_POINTS)
+            found = self._shape.closest(start + tried[:, None] * displacement)
+            touchable = int(np.argmin(np.append(self._is_touchable(found), False)))
+            low = float(tried[max(touchable - 1, 0)])
+            high = float(tried[min(touchable, SEARCH_POINTS - 1)])
+        return self._shape.closest(start + max(low - margin, 0.0) * displacement)
+
+    def _is_touchable(self, found: Nearest) -> NDArray[np.bool_]:
+        tilt_is_small = found.normal @ self._towards_user >= self._min_cos_tilt
+        return np.asarray(~found.on_edge & tilt_is_small)
 
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
         """Return the next point (3,), in m, on the path of the finger to the target.
@@ -75,7 +126,7 @@ class SurfacePicker:
         if distance <= max_step_m:
             return target
         straight = finger + across * (max_step_m / distance)
-        deepest_m = max(depth_m, self._depth_m(finger))
+        deepest_m = max(min(depth_m, self.max_depth_m), self._depth_m(finger))
         if self._depth_m(straight) <= deepest_m + SURFACE_TOLERANCE_M:
             return straight
         across = self.offset_point(straight, deepest_m) - finger

@@ -102,7 +102,10 @@ class FemSolver(Node):
             f"{1e3 * depth_m:g} mm"
             for depth_m in body.NOTED_DEPTHS_M
         )
-        return f"{current.method.name}, force error up to {errors} depth, {nodes} skin nodes"
+        return (
+            f"{current.method.name}, force error up to {errors} depth relative to the reference, "
+            f"{nodes} skin nodes"
+        )
 
     async def close(self) -> None:
         self._stop.set()

@@ -340,10 +340,12 @@ class TwinFingerNode(Node):
         read_out_ns = start_ns + self.exposure_ns + round(1e9 * self._read_out_s)
         await self._sleep_until(read_out_ns)
         self.twin__stereo.publish(pair, source_ns=middle_ns)
-        path = f'path "{self.path_label}", ' if self.path_label else ""
-        self.note = f"{path}{self.missed_frames} frames missed"
+        parts = [f'path "{self.path_label}"'] if self.path_label else []
+        if self.missed_frames:
+            parts.append(f"{self.missed_frames} frames missed because the computer was busy")
         if self.parameters.hand == "coupled" and self.coupled is None:
-            self.note = f"{self.note}; the force of the sheet on the finger is being computed"
+            parts.append("the force of the sheet on the finger is being computed")
+        self.note = ", ".join(parts)
 
     async def _sleep_until(self, at_ns: int) -> None:
         await asyncio.sleep(max(0.0, (at_ns - self.clock.now_ns()) * 1e-9))
