@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     Arming,
@@ -177,7 +178,7 @@ class ArmBridge(Node):
             await self._exchange(geometry, other, step_s)
         control = self._control
         doing = f"{control.mode} {control.reason}".rstrip()
-        self.note = f"{doing}; {self._failures} failed exchanges"
+        self.note = f"{doing}; {self._failures} {NodeNote.FAILED_EXCHANGES.phrase}"
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
             state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)

@@ -9,6 +9,7 @@ from threading import Event
 from typing import Any, ClassVar, TypeVar
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, ParameterChange, Skin, SoftBody
 from flexsheet.nodes import OmissionReason, cache
@@ -102,7 +103,10 @@ class FemSolver(Node):
             f"{1e3 * depth_m:g} mm"
             for depth_m in body.NOTED_DEPTHS_M
         )
-        return f"{current.method.name}, force error up to {errors} depth, {nodes} skin nodes"
+        return (
+            f"{current.method.name}, {NodeNote.FORCE_ERROR.phrase} {errors} depth, "
+            f"{nodes} skin nodes"
+        )
 
     async def close(self) -> None:
         self._stop.set()

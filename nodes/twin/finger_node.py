@@ -19,6 +19,7 @@ from pydantic import Field
 
 from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
 from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
@@ -341,7 +342,7 @@ class TwinFingerNode(Node):
         await self._sleep_until(read_out_ns)
         self.twin__stereo.publish(pair, source_ns=middle_ns)
         path = f'path "{self.path_label}", ' if self.path_label else ""
-        self.note = f"{path}{self.missed_frames} frames missed"
+        self.note = f"{path}{self.missed_frames} {NodeNote.FRAMES_MISSED.phrase}"
         if self.parameters.hand == "coupled" and self.coupled is None:
             self.note = f"{self.note}; the force of the sheet on the finger is being computed"
 
