@@ -10,11 +10,13 @@ class FlexsheetError(Exception):
 
     code: name of the error for the command `flexsheet explain`.
     remedy: text that states what the user can do.
+    phrase: text that every error of this class contains; "" if there is none.
     exit_code: exit status of a command that ends with this error.
     """
 
     code: ClassVar[str]
     remedy: ClassVar[str]
+    phrase: ClassVar[str] = ""
     exit_code: int = 1
 
     def __str__(self) -> str:

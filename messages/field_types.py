@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -21,13 +23,43 @@ def describe_field_type(field: FieldInfo) -> str:
 def describe_field(field: FieldInfo) -> dict[str, str]:
     """Return the type (as plain text), the default value and the description of a field."""
     default = "empty" if field.default_factory is not None else str(field.default)
-    # Replace Markdown links by their text.
-    kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     return {
-        "type": re.sub(r"[`\\]", "", kind),
+        "type": strip_markdown(describe_field_type(field)),
         "default": "required" if field.is_required() else default,
         "description": field.description or "",
     }
+
+
+def strip_markdown(text: str) -> str:
+    """Remove the marks of code from Markdown, and replace its links by their text."""
+    return re.sub(r"[`\\]", "", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text))
+
+
+def describe_bounds(field: FieldInfo) -> list[str]:
+    """Return the bounds of a field's values as text, for example `> 0`."""
+    return [note for extra in _constraints(field) if (note := _constraint(extra))]
+
+
+def _constraints(field: FieldInfo) -> Iterator[Any]:
+    yield from field.metadata
+    for argument in get_args(field.annotation):
+        if get_origin(argument) is Annotated:
+            for extra in get_args(argument)[1:]:
+                yield from getattr(extra, "metadata", ())
+
+
+def _constraint(extra: Any) -> str:
+    match extra:
+        case Gt(gt=bound):
+            return f"> {bound}"
+        case Ge(ge=bound):
+            return f"≥ {bound}"
+        case Lt(lt=bound):
+            return f"< {bound}"
+        case Le(le=bound):
+            return f"≤ {bound}"
+        case _:
+            return ""
 
 
 def get_annotation(field: FieldInfo) -> Any:

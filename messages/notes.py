@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from enum import Enum
+from typing import TYPE_CHECKING
 
-from flexsheet.messages.types import FingertipReason, SelfCheck, SheetReason, SuspectedCause
+if TYPE_CHECKING:  # the import takes longer than `flexsheet explain` may take
+    from flexsheet.messages.types import FingertipReason, SelfCheck, SheetReason, SuspectedCause
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
 
@@ -13,89 +15,110 @@ class NodeNote(Enum):
     """The problems that nodes report and that require an action of the user.
 
     phrase: constant part of the reported text.
+    meaning: sentence that describes the problem.
     remedy: text that states what the user can do.
     """
 
     COMPUTER_BUSY = (
         "is busy:",
+        "The processes of the graph wait too long for a processor.",
         "Nodes wait for a processor. End other programs, or give the graph more cores.",
     )
     TARGET_OR_ARM_LATE = (
         "the sheet target or the other arm is late",
+        "The arm brakes because no new sheet target or state of the other arm arrives.",
         BUSY_FIRST + "Then check the network, and the rate of each topic: `flexsheet topic hz`.",
     )
     OTHER_ARM_SILENT = (
         "the other arm is silent",
+        "The arm stops because the other arm's bridge sends no state.",
         BUSY_FIRST + "Then check the log of the other bridge, and the network.",
     )
     NO_SHEET_TARGET = (
         "no sheet target",
+        "The arm stops because the planner sends no sheet target.",
         BUSY_FIRST + "Then check camera, triangulator and planner: `flexsheet topic hz`.",
     )
     PLANNER_ENDED = (
         "the connection to the planner has ended",
+        "The arm stops because the process of the planner, or of a node before it, has ended.",
         "A node between camera and planner has ended and restarts. If the note remains, read its "
         "log: `flexsheet logs`.",
     )
     OTHER_BRIDGE_ENDED = (
         "the connection to the other arm's bridge has ended",
+        "The arm stops because the process of the other arm's bridge has ended.",
         "The bridge has ended and restarts. If the note remains, read its log: `flexsheet logs`.",
     )
     ARM_WATCHDOG = (
         "the arm's watchdog stopped it",
+        "The arm's controller stopped the arm because no command arrived in time.",
         BUSY_FIRST + "Then read the log of the arm's bridge, which sent no command for 100 ms.",
     )
     WAITING_FOR_ARM = (
         "waiting for the arm",
+        "The bridge has no connection to the arm's controller yet.",
         "Wait for the arm's controller. If the note remains, check its power, address and cable.",
     )
     WAITING_FOR_OTHER_ARM = (
         "waiting for the other arm",
+        "The bridge has received no state of the other arm yet.",
         "The other arm's bridge is starting. If the note remains, read its log: `flexsheet logs`.",
     )
     FOLLOWS_OTHER_ARM = (
         "waits for the other arm",
+        "The arm is ready and starts to move together with the other arm.",
         "Both arms move together. `flexsheet arms status` shows what the other arm waits for.",
     )
     OTHER_ARM_NOT_READY = (
         "the other arm is not ready",
+        "The arm does not move because the other arm is not enabled.",
         "Run `flexsheet arms enable`, which prints the reason if an arm is not ready.",
     )
     OTHER_ARM_FAULT = (
         "other arm:",
+        "The arm has stopped because the other arm has a fault.",
         "Remove the cause at the other arm. Then run `flexsheet arms reset`.",
     )
     NOT_READY = (
         "not ready",
+        "The arm is not enabled.",
         "Check that nobody is near the arms. Then run `flexsheet arms enable`.",
     )
     DISABLED = (
         "disabled",
+        "An operator has disabled the arms.",
         "An operator has disabled the arms. Ask for the reason. Then run `flexsheet arms enable`.",
     )
     RESTARTING = (
         "restarts after a reset",
+        "The bridge starts again after a reset.",
         "Wait a second. If the note remains, read the log of the bridge: `flexsheet logs`.",
     )
     ARM_STANDS_STILL = (
         "waits for the arm to stand still",
+        "The bridge enables the arm only when the arm does not move.",
         "Wait until the arm rests. If the note remains, check that nothing moves it.",
     )
     CHECKING_PATH = (
         "checks the path to the target",
+        "The bridges search for a path to the sheet without collision.",
         "Wait: the arms search for a path without collision, which takes a few seconds at most.",
     )
     MEASURED_VIOLATION = (
         "measured:",
+        "The measured pose of the arm is outside a limit.",
         "The arm has left its limits. Move it back by hand. Then run `flexsheet arms reset`.",
     )
     COMMANDED_VIOLATION = (
         "commanded:",
+        "A computed command was outside a limit.",
         "A command was outside a limit and was not sent. Run `flexsheet arms reset`, and report "
         "this error with a recording.",
     )
     SKEWED_EDGE = (
         "the edge is skewed by",
+        "The two arms hold the edges of the sheet at different angles.",
         BUSY_FIRST
         + "Then check whether one arm has stopped or lags (`flexsheet arms status`), and "
         "whether the bases are calibrated (docs/set-up-arms.md). After a fault, run "
@@ -103,82 +126,120 @@ class NodeNote(Enum):
     )
     JOINT_RANGE = (
         "joint out of range",
+        "The arm's controller refused a joint angle outside its range.",
         "The controller refused a joint angle. Compare its limits with `arms` of the scene.",
     )
     STEP_SIZE = (
         "step too large",
+        "The arm's controller refused a command too far from the previous one.",
         "The controller refused a step. Compare its speed limits with `arms` of the scene.",
     )
     COMMAND_NOT_FINITE = (
         "command not finite",
+        "The arm's controller received a command that contains NaN or infinity.",
         "The controller received an invalid number. Check the network, and report this error.",
     )
     CONTROLLER_WATCHDOG = (
         "watchdog: no command",
+        "The program of the arm's controller stopped because no command arrived.",
         BUSY_FIRST + "Then read the log of the arm's bridge, and run `flexsheet arms reset`.",
     )
     STATUS_STALE = (
         "its joint angles are not used",
+        "The arm's controller answers with old joint angles.",
         "The controller's program has stopped or restarts. Check the program. Then run "
         "`flexsheet arms reset`.",
     )
     NO_PATH = (
         "no path:",
+        "The arms cannot reach the sheet from their present poses without a collision.",
         "Move the arms nearer to the sheet by hand, or move the sheet (docs/arms.md).",
     )
     NOT_RECORDING = (
         "NOT RECORDING:",
+        "The recorder cannot write the bag.",
         "Free space on the disk, or record to another disk. The next bag starts automatically.",
     )
     NODE_HUNG = (
         "hung: no heartbeat",
+        "A node has not responded within its time-out.",
         "The node is restarted. The end of its log (`flexsheet logs`) shows its stack. The key "
         "`liveness_s` of the launch file sets the time-out.",
     )
     KEY_REFUSED = (
         "rejects the key of this host; check its launch file",
+        "Another host refused the connection because it does not know this host's key.",
         "The launch file of that host has no key or another key for this host. Copy the newest "
         "launch file to all hosts; `flexsheet doctor hosts` lists the differences.",
     )
     NO_KEYS_THERE = (
         "does not accept keys; its launch file may have none",
+        "This host uses keys, but the other host uses none.",
         "Start all hosts with the same launch file, which must contain keys.",
     )
     KEY_NOT_PROVED = (
         "did not prove that it has its key",
+        "The other host does not have the secret key of its address.",
         "The secret key of that host does not match its public key in the launch file, or another "
         "program uses its address. `flexsheet doctor hosts` shows which host it is.",
     )
     READER_TOO_SLOW = (
         "a subscriber or the network is too slow",
+        "A reader has lost messages because it did not read them in time.",
         "`flexsheet topic echo status` shows which port drops messages. Give that node more "
         "processor time, or the link more bandwidth.",
     )
     MAY_NOT_RESET = (
         "may not reset an e-stop",
+        "The launch file does not permit this host to reset an e-stop.",
         "Reset it on a host for which the launch file sets `hosts.NAME.may_reset_estop`.",
     )
     CLOCK_NOT_MEASURED = (
         "is not measured",
+        "The offset of another host's clock is not known yet.",
         "Wait a few seconds after a start. If the note remains, the clock node or the network of "
         "that host is down (docs/clocks.md).",
     )
     CLOCK_UNCERTAIN = (
         "ms are allowed",
+        "The offset of another host's clock is known too inaccurately.",
         "Reduce the traffic of the network, set up chrony, or increase `max_offset_uncertainty_s` "
         "(docs/clocks.md).",
     )
     ESTOP_KEPT = (
         "latched until it is reset",
+        "An e-stop is engaged and keeps the arms stopped.",
         "Run `flexsheet arms reset` when the danger is over.",
     )
     LAST_SHEET_PLANE = (
         "keeping the last valid sheet plane",
-        "The arms send no state, or the sheet faces away. The renderer recovers automatically.",
+        "The renderer has no valid new pose of the sheet and uses the last one.",
+        BUSY_FIRST + "The renderer or a bridge may lack processor time. Then check the arms' rate: "
+        "`flexsheet topic hz arm_left`. The image recovers automatically.",
+    )
+    FRAMES_MISSED = (
+        "frames missed",
+        "The note counts the images since its start that the simulated camera did not take.",
+        "No action is needed unless the number grows steadily. " + BUSY_FIRST,
+    )
+    FAILED_EXCHANGES = (
+        "failed exchanges",
+        "The note counts the commands since the start of the bridge that the arm did not answer.",
+        "No action is needed unless the number grows steadily. "
+        + BUSY_FIRST
+        + "Then check the cable and the network of the arm.",
+    )
+    FORCE_ERROR = (
+        "force error up to",
+        "The note states the relative force error that the method of the soft body is known to "
+        "have at two depths of a push.",
+        "The node runs. If the error exceeds `tolerances.force_ratio` of the scene, let "
+        "`flexsheet tune` choose `methods.soft_body`.",
     )
 
-    def __init__(self, phrase: str, remedy: str) -> None:
+    def __init__(self, phrase: str, meaning: str, remedy: str) -> None:
         self.phrase = phrase
+        self.meaning = meaning
         self.remedy = remedy
 
     @property
@@ -222,6 +283,20 @@ SHEET_REASON_REMEDIES: dict[SheetReason, str] = {
 }
 """The remedy for each `reason` in the topic `sheet_target`, except "ok"."""
 
+
+FINGERTIP_REASON_TEXTS: dict[FingertipReason, str] = {
+    "no_marker": "no marker was found",
+    "marker_in_one_view": "only one camera sees the marker",
+    "two_markers": "there are several possible markers",
+    "merged": "the marker's image touches another bright spot",
+    "blurred": "the marker moves too fast for the exposure",
+    "saturated": "the marker is overexposed",
+    "outside_volume": "the marker is outside the finger's possible positions",
+    "inconsistent": "the rays of the two cameras do not intersect",
+    "too_fast": "the marker is faster than a finger",
+    "unconfirmed": "there are too few detections for a track",
+}
+"""The meaning of each `reason` in the topic `fingertip`, except "ok"."""
 
 FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
     "no_marker": "Move the finger into view, replace a lost marker, or use a longer exposure.",

@@ -124,6 +124,7 @@ class UnknownTopicError(FlexsheetError, KeyError):
     code = "unknown-topic"
     exit_code = 2
     remedy = "`flexsheet topic list` prints all names."
+    phrase = "unknown topic"
 
 
 def find_topic(name: str) -> Topic:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexsheet.launch.commands.scene import keys
 from flexsheet.launch.commands.session import describe_node, describe_output, explain_counts
 from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
@@ -700,3 +701,13 @@ def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
 def test_a_command_of_ros_2_names_its_replacement(flexsheet: Command) -> None:
     printed = flexsheet("interface", "show", "Fingertip")
     assert (printed.code, "topic info TOPIC" in printed.err) == (2, True)
+
+
+def test_the_keys_of_scene_files_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    keys(as_json=True)
+    groups = json.loads(capsys.readouterr().out)
+    (kind,) = (row for row in groups["support: base"] if row["key"] == "object.support.kind")
+    assert (kind["type"], kind["default"]) == ("base", "base")
+    keys(as_json=False)
+    printed = capsys.readouterr().out
+    assert all(row["key"] in printed for rows in groups.values() for row in rows)

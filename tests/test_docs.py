@@ -27,7 +27,7 @@ from tests.doc_pages import (
 )
 from website.finish import NetworkError, finish
 from website.graph import LAB, TWIN, GraphDrawing
-from website.pages import CHARTS, drawings
+from website.pages import CHARTS, INCLUDE, TABLES, drawings
 from website.scene_page import missing_effects
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
@@ -117,6 +117,22 @@ def test_generated_tables_contain_nothing_of_the_machine() -> None:
 
 def test_each_key_of_a_scene_file_has_a_described_effect() -> None:
     assert missing_effects() == [], "describe the field, or add it to EFFECTS of the page"
+
+
+@pytest.mark.parametrize("table", sorted(TABLES))
+def test_a_page_with_a_generated_table_names_the_command_that_prints_it(table: str) -> None:
+    commands = {
+        "commands": "flexsheet --help",
+        "errors": "flexsheet explain",
+        "message-types": "flexsheet topic info TOPIC",
+        "parameters": "flexsheet node info TYPE",
+        "scene-keys": "flexsheet scene keys",
+        "topics": "flexsheet topic list",
+    }
+    (page,) = (
+        text for one in DOCS.glob("*.md") if table in INCLUDE.findall(text := one.read_text())
+    )
+    assert f"`{commands.get(table, f'python -m website.pages {table}')}`" in page
 
 
 def test_all_pages_are_linked_from_a_page_of_the_site() -> None:

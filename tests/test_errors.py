@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import pkgutil
+import subprocess
+import sys
 from collections import Counter
+from importlib import import_module
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
 from flexsheet.launch import cli
-from flexsheet.launch.commands.explain import Entry, entries, find_entries
+from flexsheet.launch.commands.explain import Entry, entries, explain, find_entries
 from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.bag import BagError
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.notes import (
+    FINGERTIP_REASON_TEXTS,
     FINGERTIP_REMEDIES,
     SELF_CHECK_FINDINGS,
     SELF_CHECK_REMEDIES,
@@ -29,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def kinds_of(kind: type[FlexsheetError]) -> list[type[FlexsheetError]]:
-    """Return all subclasses of an error class. The function `entries` imports their modules."""
+    """Return all imported subclasses of an error class."""
     derived = [one for one in kind.__subclasses__() if one.__module__.startswith("flexsheet.")]
     return derived + [below for one in derived for below in kinds_of(one)]
 
@@ -37,13 +42,21 @@ def kinds_of(kind: type[FlexsheetError]) -> list[type[FlexsheetError]]:
 def test_every_kind_of_error_has_its_own_code_and_remedy() -> None:
     codes = Counter(entry.code for entry in entries())
     assert set(codes.values()) == {1}
-    for kind in kinds_of(FlexsheetError):
+    for layer in ("messages", "nodes", "launch"):
+        root = import_module(f"flexsheet.{layer}")
+        for module in pkgutil.walk_packages(root.__path__, f"{root.__name__}."):
+            import_module(module.name)
+    kinds = kinds_of(FlexsheetError)
+    explained = {one.name: (one.code, one.remedy, one.phrase) for one in entries() if one.name}
+    assert explained == {one.__name__: (one.code, one.remedy, one.phrase) for one in kinds}
+    for kind in kinds:
         assert {"code", "remedy"} <= set(vars(kind)), f"{kind.__name__} lacks a code or a remedy"
         assert kind.__doc__
 
 
 def test_every_reason_of_an_invalid_fingertip_has_a_remedy() -> None:
-    assert set(FINGERTIP_REMEDIES) == set(get_args(FingertipReason)) - {"ok"}
+    reasons = set(get_args(FingertipReason)) - {"ok"}
+    assert set(FINGERTIP_REMEDIES) == set(FINGERTIP_REASON_TEXTS) == reasons
 
 
 def test_every_reason_of_a_sheet_at_rest_has_a_text_and_a_remedy() -> None:
@@ -58,7 +71,7 @@ def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "code"),
+    ("text", "codes"),
     [
         ("bag", "bag"),
         ("BagError", "bag"),
@@ -67,22 +80,52 @@ def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:
         ("The sheet holds its pose: the measured fingertip is too old.", "fingertip_too_old"),
         ("The left arm reports: waits for the arm to stand still.", "arm-stands-still"),
         ("left arm: fault (arm: joint out of range)", "joint-range"),
-        ("measured: the edge is skewed by 14.3 degrees relative to the line", "skewed-edge"),
+        (
+            "measured: the edge is skewed by 14.3 degrees relative to the line",
+            "skewed-edge measured-violation",
+        ),
         ("the handler of a message failed: UnreachableError: no joint angles", "unreachable"),
         (f'topic "arm_left": host left {NodeNote.KEY_REFUSED.phrase}', "key-refused"),
         ('unknown topic "fingr"; did you mean "finger"?', "unknown-topic"),
-        ("a.mcap: the file exists already; a bag cannot be overwritten", "bag"),
+        ("the arm poses are 0.92 s old: keeping the last valid sheet plane", "last-sheet-plane"),
+        ("4 frames missed", "frames-missed"),
+        ("idle; 2 failed exchanges", "failed-exchanges"),
+        ("soft body by linear, force error up to 76 % at 1 mm depth", "force-error"),
         ("no graph is running; start one with: flexsheet launch FILE", "no-graph"),
     ],
 )
-def test_a_code_a_class_or_a_text_is_explained(text: str, code: str) -> None:
-    first = find_entries(text)[0]
-    assert first.code == code
-    assert first.remedy
+def test_a_code_a_class_or_a_text_is_explained(text: str, codes: str) -> None:
+    found = find_entries(text)
+    assert [one.code for one in found] == codes.split()
+    assert all(one.meaning and one.remedy for one in found)
 
 
-def test_nothing_is_explained_without_a_match() -> None:
-    assert find_entries("xyzzy plugh") == []
+@pytest.mark.parametrize("text", ["xyzzy plugh", "the mesh of the table is late", "not readying"])
+def test_a_text_that_only_shares_words_with_an_explanation_is_not_explained(text: str) -> None:
+    assert find_entries(text) == []
+
+
+def test_without_an_argument_all_codes_are_listed_with_their_meaning(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    explain(message=None)
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split()[0] for line in lines] == [entry.code for entry in entries()]
+    assert all(len(line.split()) > 2 for line in lines)
+
+
+def test_an_unknown_code_points_to_the_list_and_to_a_similar_code() -> None:
+    with pytest.raises(CommandError, match=r'did you mean "unknown-topic".*`flexsheet explain`'):
+        explain(message="unknwon-topic")
+    with pytest.raises(CommandError, match="matches; `flexsheet explain` lists all codes"):
+        explain(message="xyzzy plugh")
+
+
+def test_the_explanations_do_not_import_the_modules_of_the_errors() -> None:
+    code = "from flexsheet.launch.commands.explain import entries; import sys; entries(); "
+    code += "print(*sys.modules.keys() & {'numpy', 'pydantic', 'scipy', 'zmq'})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 @pytest.mark.parametrize(
@@ -112,6 +155,7 @@ def test_an_entry_of_an_error_has_the_first_paragraph_of_its_class() -> None:
             meaning=" ".join((UnknownTopicError.__doc__ or "").split()),
             remedy=UnknownTopicError.remedy,
             name="UnknownTopicError",
+            phrase="unknown topic",
         )
         in entries()
     )

@@ -8,7 +8,12 @@ from typing import Any
 from flexsheet.launch.commands.explain import entries
 from flexsheet.launch.commands.man import list_commands
 from flexsheet.launch.commands.output import examples_in
-from flexsheet.messages.notes import FINGERTIP_REMEDIES, SELF_CHECK_FINDINGS, SELF_CHECK_REMEDIES
+from flexsheet.messages.notes import (
+    FINGERTIP_REASON_TEXTS,
+    FINGERTIP_REMEDIES,
+    SELF_CHECK_FINDINGS,
+    SELF_CHECK_REMEDIES,
+)
 from website.messages_page import format_table
 
 
@@ -58,8 +63,15 @@ def render_errors() -> str:
     """Return the tables of errors, notes, reasons and causes."""
     full, short = ("code", "meaning", "what to do"), "what to do"
     errors = [(f"`{one.code}`", one.meaning, one.remedy) for one in entries() if one.name]
-    notes = [(f"`{one.code}`", f"`{one.phrase}`", one.remedy) for one in entries() if one.phrase]
-    reasons = [(f"`{reason}`", remedy) for reason, remedy in FINGERTIP_REMEDIES.items()]
+    notes = [
+        (f"`{one.code}`", f"`{one.phrase}`", one.meaning, one.remedy)
+        for one in entries()
+        if one.phrase and not one.name
+    ]
+    reasons = [
+        (f"`{reason}`", FINGERTIP_REASON_TEXTS[reason], remedy)
+        for reason, remedy in FINGERTIP_REMEDIES.items()
+    ]
     causes = [
         (f"`{cause}`", finding, SELF_CHECK_REMEDIES[cause])
         for cause, finding in SELF_CHECK_FINDINGS.items()
@@ -69,9 +81,9 @@ def render_errors() -> str:
             "## Errors of commands and nodes\n",
             format_table(full, errors),
             "## Notes of nodes\n",
-            format_table(full, notes),
+            format_table(("code", "text", "meaning", "what to do"), notes),
             "## Reasons of an invalid fingertip\n",
-            format_table(("`reason`", short), reasons),
+            format_table(("`reason`", "meaning", short), reasons),
             "## Causes that self-checks suspect\n",
             format_table(("`cause`", "meaning", short), causes),
         ]

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, get_args, get_origin
+from typing import Any, get_args
 
-from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from flexsheet.launch.ros2.inputs import INPUTS
 from flexsheet.launch.ros2.mapping import OWN_PREFIX, list_ros_topics
 from flexsheet.messages.base import Header
-from flexsheet.messages.field_types import describe_field_type
+from flexsheet.messages.field_types import describe_bounds, describe_field_type
 from flexsheet.messages.topics import TOPICS, Topic
 
 
@@ -87,33 +86,6 @@ def _field_notes(field: FieldInfo) -> str:
     if field.description:
         notes.append(field.description)
     return "; ".join(notes)
-
-
-def describe_bounds(field: FieldInfo) -> list[str]:
-    """Return the bounds of a field's values as text, for example `> 0`."""
-    return [note for extra in _constraints(field) if (note := _constraint(extra))]
-
-
-def _constraints(field: FieldInfo) -> Iterator[Any]:
-    yield from field.metadata
-    for argument in get_args(field.annotation):
-        if get_origin(argument) is Annotated:
-            for extra in get_args(argument)[1:]:
-                yield from getattr(extra, "metadata", ())
-
-
-def _constraint(extra: Any) -> str:
-    match extra:
-        case Gt(gt=bound):
-            return f"> {bound}"
-        case Ge(ge=bound):
-            return f"≥ {bound}"
-        case Lt(lt=bound):
-            return f"< {bound}"
-        case Le(le=bound):
-            return f"≤ {bound}"
-        case _:
-            return ""
 
 
 def nested_models(annotation: Any) -> Iterator[type[BaseModel]]:

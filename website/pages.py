@@ -2,6 +2,7 @@
 
 python -m website.pages        write the figures of pages, and the drawings of docs/images
 python -m website.pages site   write build/docs: docs/ with all generated tables and charts
+python -m website.pages NAME   print the entry NAME of `TABLES`
 
 A line `<!-- include: NAME -->` of a page is replaced in the site by the entry NAME of `TABLES`.
 """
@@ -97,6 +98,8 @@ if __name__ == "__main__":
     if sys.argv[1:] == ["site"]:
         build(SITE_INPUT)
         draw_charts(SITE_INPUT / "charts")
+    elif sys.argv[1:]:
+        print(TABLES[sys.argv[1]]())
     else:
         for page in (ROOT / "README.md", *DOCS.glob("*.md")):
             page.write_text(figures.update(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -2,174 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from types import NoneType
-from typing import Annotated, Any, get_args, get_origin
-
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
-
-from flexsheet.launch.objects.meshes import MeshFile
-from flexsheet.messages.field_types import describe_field_type
-from flexsheet.messages.scene import Lens, Mesh, Pose, Scene
-from flexsheet.messages.units import find_unit
-from website.messages_page import describe_bounds, format_table
-
-LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
-"""The types that the page describes only once."""
-
-EFFECTS: Mapping[str, str] = {
-    "name": "name in logs, bags and reports",
-    "object.material.young_modulus_pa": "stiffness of the object; determines force and deformation",
-    "object.material.poisson_ratio": "lateral expansion under compression; close to 0.5: nearly "
-    "constant volume",
-    "object.world_from_object": "position and orientation of the object",
-    "object.geometry.radius_m": "radius",
-    "object.geometry.length_m": "length along the axis",
-    "object.geometry.edge_radius_m": "radius of the rounded edges",
-    "object.support.centre_m": "centre of the sphere, object frame",
-    "object.support.radius_m": "radius of the sphere",
-    "object.support.max_m": "upper corner of the box, object frame",
-    "object.support.min_m": "lower corner of the box, object frame",
-    "object.appearance.texture": "texture of the rendered object",
-    "sheet.thickness_m": "thickness of the rubber; determines the force for a stretch",
-    "sheet.young_modulus_pa": "stiffness of the rubber; determines the force for a stretch",
-    "sheet.max_stretch_ratio": "maximum length over slack length that the planner commands",
-    "sheet.min_stretch_ratio": "minimum length over slack length that the planner commands",
-    "sheet.max_edge_force_n": "maximum force of the sheet on an arm that the planner commands",
-    "arms.left.world_from_base": "base of the left arm",
-    "arms.right.world_from_base": "base of the right arm",
-    "arms.max_tool_speed_m_per_s": "speed limit of both flanges",
-    "arms.workspace_max_m": "upper corner of the box that limits the flanges, world",
-    "camera.device": "name of the stereo rig; images of another one are refused",
-    "camera.width_px": "width of an image",
-    "camera.height_px": "height of an image",
-    "camera.rate_hz": "image pairs per second",
-    "camera.exposure_s": "exposure time; a fingertip is stamped at its middle",
-    "camera.left": "left lens",
-    "camera.right": "right lens",
-    "camera.right_from_left": "4x4 transform from the left to the right camera frame",
-    "camera.world_from_left": "pose of the left camera",
-    "projector.width_px": "width of a frame",
-    "projector.height_px": "height of a frame",
-    "projector.lens": "lens of the projector",
-    "projector.world_from_projector": "pose of the projector",
-    "eyes.centre_world_m": "point between the eyes; images are corrected for it",
-    "eyes.interocular_m": "distance between the eyes; 0: one eye",
-    "finger.radius_m": "radius of the fingertip, for contact and deformation",
-    "finger.max_speed_m_per_s": "maximum speed of a fingertip that the tracking assumes",
-    "finger.volume_max_m": "upper corner of the box of possible fingertips, world",
-    "working_range.push_depth_m": "maximum depth of a push",
-    "working_range.tilt_rad": "maximum tilt of the sheet",
-    "working_range.speed_m_per_s": "maximum speed of a stroke",
-    "tolerances.fingertip_m": "error of the fingertip's position",
-    "tolerances.force_ratio": "relative error of the force",
-    "tolerances.sheet_position_m": "distance between the sheet and the finger",
-    "tolerances.latency_s": "time from the exposure to a frame",
-    "methods.marker": "detection of the marker in an image",
-    "methods.tracking": "motion model of the fingertip",
-    "methods.sheet_force": "model of the sheet's force",
-    "methods.sheet_shape": "model of the sheet's shape for the image correction",
-    "methods.correction": "correction of the projected image",
-    "methods.soft_body.method": "deformation of the object",
-    "methods.soft_body.skin_spacing_m": "distance of the nodes on the object's surface",
-    "position_m": "origin of the frame",
-    "rpy_rad": "rotations about the fixed axes x, y and z, in this order",
-    "fx_px": "focal length in x",
-    "fy_px": "focal length in y",
-    "cx_px": "principal point in x",
-    "cy_px": "principal point in y",
-    "distortion": "Brown's coefficients k1, k2, p1, p2, k3 in OpenCV's convention",
-}
-"""The effects of keys whose fields do not describe them sufficiently."""
+from flexsheet.launch.objects.scene_keys import KeyGroup, SceneKey, list_groups
+from website.messages_page import format_table
 
 
 def render() -> str:
     """Return a table for each group of keys."""
-    sections = ["## Top level\n", _table(_rows(Scene, "", recursive=False))]
-    for name, field in Scene.model_fields.items():
-        kind = _single_model(field.annotation)
-        if kind is None:
-            continue
-        sections += [f"## {name}\n", _first_paragraph(kind), _table(_rows(kind, f"{name}."))]
-        if name == "object":
-            sections += _variants("geometry", kind) + _variants("support", kind)
-    for leaf in LEAVES:
-        sections += [f"## {leaf.__name__}\n", _first_paragraph(leaf), _table(_rows(leaf, ""))]
-    return "\n".join(sections)
+    return "\n".join(_section(group) for group in list_groups())
+
+
+def _section(group: KeyGroup) -> str:
+    heading = f"{'###' if group.is_variant else '##'} {group.title}\n"
+    rows = [(f"`{one.key}`", one.type, one.unit, _default(one), one.effect) for one in group.keys]
+    table = format_table(("key", "type", "unit", "default", "effect"), rows)
+    return "\n".join([heading, *([f"{group.about}\n"] if group.about else []), table])
+
+
+def _default(key: SceneKey) -> str:
+    return key.default if key.default in ("required", "none") else f"`{key.default}`"
 
 
 def missing_effects() -> list[str]:
     """Return the keys of a scene file that have no description of their effect."""
-    rows = [line for line in render().splitlines() if line.startswith("| `")]
-    return [row.split("`")[1] for row in rows if row.split(" | ")[-1].strip(" |") == ""]
-
-
-def _variants(key: str, kind: type[BaseModel]) -> list[str]:
-    """Return a section for each type that the key of the object can have."""
-    field = kind.model_fields[key]
-    sections = []
-    for variant in get_args(field.annotation):
-        if variant is NoneType:
-            continue
-        model = MeshFile if variant is Mesh else variant
-        tag = next(iter(get_args(model.model_fields[str(field.discriminator)].annotation)))
-        sections += [
-            f"### {key}: {tag.replace('_', ' ')}\n",
-            _first_paragraph(model),
-            _table(_rows(model, f"object.{key}.")),
-        ]
-    return sections
-
-
-def _rows(
-    kind: type[BaseModel], prefix: str, *, recursive: bool = True
-) -> Iterator[tuple[str, ...]]:
-    for name, field in kind.model_fields.items():
-        inner = _single_model(field.annotation)
-        if inner is not None and inner not in LEAVES:
-            if recursive:
-                yield from _rows(inner, f"{prefix}{name}.")
-        elif field.discriminator is not None:
-            effect = field.description or "shape of the object"
-            yield f"`{prefix}{name}`", "one of the types below", "", _default(field), effect
-        elif prefix + name == "object.appearance.image":
-            yield (
-                "`object.appearance.image_file`", "str", "", "none",
-                "image file for `texture: image`, relative to the scene file",
-            )  # fmt: skip
-        else:
-            effect = EFFECTS.get(prefix + name) or field.description or _tag_effect(field)
-            yield f"`{prefix}{name}`", _type(field), find_unit(name), _default(field), effect
-
-
-def _tag_effect(field: FieldInfo) -> str:
-    return "selects this type" if len(get_args(field.annotation)) == 1 else ""
-
-
-def _type(field: FieldInfo) -> str:
-    return ", ".join([describe_field_type(field), *dict.fromkeys(describe_bounds(field))])
-
-
-def _default(field: FieldInfo) -> str:
-    if field.is_required():
-        return "required"
-    value = field.get_default(call_default_factory=True)
-    return "none" if value is None else f"`{list(value) if isinstance(value, tuple) else value}`"
-
-
-def _single_model(annotation: Any) -> type[BaseModel] | None:
-    """Return the model type of an annotation `Model` or `Model | None`; None for others."""
-    if get_origin(annotation) is Annotated:
-        return None
-    kinds = [one for one in (annotation, *get_args(annotation)) if isinstance(one, type)]
-    models = [one for one in kinds if issubclass(one, BaseModel)]
-    return models[0] if len(models) == 1 else None
-
-
-def _first_paragraph(kind: type[BaseModel]) -> str:
-    return " ".join((kind.__doc__ or "").strip().split("\n\n")[0].split()) + "\n"
-
-
-def _table(rows: Iterable[tuple[str, ...]]) -> str:
-    return format_table(("key", "type", "unit", "default", "effect"), rows)
+    return [one.key for group in list_groups() for one in group.keys if not one.effect]

@@ -5,13 +5,12 @@ A note is a short text in a node's status that describes a problem of the node.
 
 from __future__ import annotations
 
-import pkgutil
+import ast
 import re
-from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache
-from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -23,24 +22,20 @@ from flexsheet.launch.commands.output import (
     examples,
     print_fields,
     print_json,
+    print_table,
 )
-from flexsheet.messages.errors import FlexsheetError
 
 app = make_app()
 
-PACKAGES = ("messages", "nodes", "launch")
-MAX_ENTRIES = 3
-MIN_WORD_LETTERS = 3
-MIN_SHARED_WORDS = 2
-"""The minimum number of words that a text and its explanation share in an inexact match."""
+LAYERS = ("messages", "nodes", "launch")
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
     """An explanation of one kind of error or note.
 
-    code: error code, or text of a note. name: name of the error class, or an empty text. phrase:
-    text that all notes of this kind contain, or an empty text.
+    code: code of an error or note. name: name of the error class, or an empty text. phrase: text
+    that all errors or notes of this kind contain, or an empty text.
     """
 
     code: str
@@ -54,6 +49,7 @@ class Entry:
 def entries() -> tuple[Entry, ...]:
     """Return the explanations of all errors, notes of nodes, and texts of the console."""
     from flexsheet.messages.notes import (
+        FINGERTIP_REASON_TEXTS,
         FINGERTIP_REMEDIES,
         SELF_CHECK_FINDINGS,
         SELF_CHECK_REMEDIES,
@@ -62,72 +58,92 @@ def entries() -> tuple[Entry, ...]:
         NodeNote,
     )
 
-    for package in PACKAGES:
-        root = import_module(f"flexsheet.{package}")
-        for module in pkgutil.walk_packages(root.__path__, f"{root.__name__}."):
-            import_module(module.name)
-    errors = {kind.code: kind for kind in _subclasses(FlexsheetError)}
     tables: tuple[tuple[dict[Any, str], dict[Any, str]], ...] = (
-        ({}, FINGERTIP_REMEDIES),
         (SHEET_REASON_TEXTS, SHEET_REASON_REMEDIES),
         (SELF_CHECK_FINDINGS, SELF_CHECK_REMEDIES),
     )
     return (
+        *_error_entries(),
+        *(Entry(one.code, one.meaning, one.remedy, phrase=one.phrase) for one in NodeNote),
         *(
-            Entry(code, _meaning(kind), kind.remedy, name=kind.__name__)
-            for code, kind in sorted(errors.items())
+            Entry(code, FINGERTIP_REASON_TEXTS[code], remedy)
+            for code, remedy in FINGERTIP_REMEDIES.items()
         ),
-        *(Entry(note.code, note.phrase, note.remedy, phrase=note.phrase) for note in NodeNote),
         *(
-            Entry(code, texts.get(code, ""), remedy, phrase=texts.get(code, ""))
+            Entry(code, texts[code], remedy, phrase=texts[code])
             for texts, remedies in tables
             for code, remedy in remedies.items()
         ),
     )
 
 
-def _subclasses(kind: type[FlexsheetError]) -> Iterator[type[FlexsheetError]]:
-    for derived in kind.__subclasses__():
-        if derived.__module__.startswith("flexsheet."):
-            yield derived
-        yield from _subclasses(derived)
+def _error_entries() -> list[Entry]:
+    """Return the explanations of all error classes, sorted by code.
 
-
-def _meaning(kind: type[FlexsheetError]) -> str:
-    return " ".join((kind.__doc__ or "").split("\n\n")[0].split())
+    The classes are read from the source files, because importing all modules takes seconds.
+    """
+    root = Path(__file__).resolve().parents[2]
+    found = []
+    for path in (path for layer in LAYERS for path in (root / layer).rglob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        if "    remedy = " not in source:
+            continue
+        for statement in ast.parse(source).body:
+            if not isinstance(statement, ast.ClassDef):
+                continue
+            values = {
+                one.targets[0].id: one.value
+                for one in statement.body
+                if isinstance(one, ast.Assign) and isinstance(one.targets[0], ast.Name)
+            }
+            if not {"code", "remedy"} <= values.keys():
+                continue
+            texts = {
+                key: str(ast.literal_eval(values[key]))
+                for key in ("code", "remedy", "phrase")
+                if key in values
+            }
+            meaning = (ast.get_docstring(statement) or "").split("\n\n")[0]
+            found.append(Entry(meaning=" ".join(meaning.split()), name=statement.name, **texts))
+    return sorted(found, key=lambda entry: entry.code)
 
 
 def find_entries(text: str) -> list[Entry]:
-    """Return the explanations of a code, a class name or an error text, with the best match first.
+    """Return the explanations of a code, a class name or a reported text.
 
-    If the text contains no class name and no phrase, it is compared word by word. Explanations with
-    at least MIN_SHARED_WORDS common words match, and rare words have more weight.
+    A text matches if it contains the name of an error class, or the phrase of a note or an error. A
+    phrase that is a part of another matching phrase is ignored. Longer phrases come first.
     """
     code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
     if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:
         return exact
-    words = _words(text)
-    named = [entry for entry in entries() if entry.name and entry.name.lower() in words]
-    contained = [entry for entry in entries() if entry.phrase and entry.phrase in text]
-    contained.sort(key=lambda entry: -len(entry.phrase))
-    if named or contained:
-        return named + contained
-    known = {entry: _words(f"{entry.code} {entry.meaning} {entry.remedy}") for entry in entries()}
-    frequency = Counter(word for one in known.values() for word in one)
-    near = {
-        entry: sum(1 / frequency[word] for word in shared)
-        for entry, one in known.items()
-        if len(shared := words & one) >= MIN_SHARED_WORDS
-    }
-    return sorted(near, key=lambda entry: -near[entry])
+    words = set(re.findall(r"\w+", text))
+    named = [entry for entry in entries() if entry.name in words]
+    contained = [entry for entry in entries() if entry.phrase and _contains(text, entry.phrase)]
+    specific = [
+        entry
+        for entry in contained
+        if not any(
+            entry.phrase != other.phrase and entry.phrase in other.phrase for other in contained
+        )
+    ]
+    specific.sort(key=lambda entry: -len(entry.phrase))
+    return named + [entry for entry in specific if entry not in named]
 
 
-def _words(text: str) -> set[str]:
-    return {word for word in re.findall(r"\w+", text.lower()) if len(word) >= MIN_WORD_LETTERS}
+def _contains(text: str, phrase: str) -> bool:
+    """Return whether a text contains a phrase, not as a part of longer words."""
+    return re.search(rf"(?<!\w){re.escape(phrase)}(?!\w)", text) is not None
+
+
+def _suggestion(text: str) -> str:
+    near = get_close_matches(text, [one.code for one in entries()], n=1)
+    return f'did you mean "{near[0]}"? ' if near else ""
 
 
 @app.command(
     epilog=examples(
+        "flexsheet explain",
         "flexsheet explain bag",
         "flexsheet explain saturated --json",
         "flexsheet explain 'topic arm_left: host left rejects the key of this host'",
@@ -135,23 +151,34 @@ def _words(text: str) -> set[str]:
 )
 def explain(
     message: Annotated[
-        str,
-        typer.Argument(help="Text, code or class name of an error, or text of a note of a node."),
-    ],
+        str | None,
+        typer.Argument(
+            help="Code or class name of an error, or text of a note of a node; without it, all "
+            "codes are listed."
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the meaning and the remedy of an error or a note; docs/errors.md lists all errors."""
-    found = [
-        {"code": one.code, "meaning": one.meaning, "remedy": one.remedy}
-        for one in find_entries(message)[:MAX_ENTRIES]
-    ]
-    if as_json:
-        print_json(found)
-    for number, entry in enumerate(() if as_json else found):
-        if number:
-            print()
-        print_fields(entry.items())
+    """Print the meaning and the remedy of an error or a note, or list all codes."""
+    found = entries() if message is None else find_entries(message)
     if not found:
         raise CommandError(
-            f'"{message}": no error or note matches; choose a code in docs/errors.md', FAILED
+            f'"{message}": no error or note matches; {_suggestion(str(message))}'
+            "`flexsheet explain` lists all codes",
+            FAILED,
         )
+    rows = [{"code": one.code, "meaning": one.meaning, "remedy": one.remedy} for one in found]
+    if as_json:
+        print_json(rows)
+    elif message is None:
+        print_table(("code", "meaning"), [(one.code, _first_sentence(one)) for one in found])
+    else:
+        for number, row in enumerate(rows):
+            if number:
+                print()
+            print_fields(row.items())
+
+
+def _first_sentence(entry: Entry) -> str:
+    first, *more = entry.meaning.split(". ", 1)
+    return f"{first}." if more else first

@@ -24,6 +24,7 @@ class NoGraphError(CommandError):
 
     code = "no-graph"
     remedy = "Start a graph with `flexsheet launch FILE`, or name the directory of its run (--run)."
+    phrase = "no graph is running"
 
     def __init__(self, text: str) -> None:
         super().__init__(text, FAILED)

@@ -1,4 +1,4 @@
-"""`flexsheet scene`: export the apparatus of a scene to other tools."""
+"""`flexsheet scene`: list the keys of scene files, and export a scene to other tools."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from flexsheet.launch.commands.output import (
     CommandError,
     examples,
     print_json,
+    print_table,
     words,
 )
 
-app = make_app("Export the apparatus of a scene to other tools.")
+app = make_app("List the keys of scene files, and export a scene to other tools.")
 
 
 SUFFIXES = {".urdf": "urdf", ".xml": "urdf", ".gltf": "gltf", ".glb": "gltf"}
@@ -24,7 +25,27 @@ SUFFIXES = {".urdf": "urdf", ".xml": "urdf", ".gltf": "gltf", ".glb": "gltf"}
 
 @app.callback()
 def scene() -> None:
-    """Export the apparatus of a scene to other tools."""
+    """List the keys of scene files, and export a scene to other tools."""
+
+
+@app.command(epilog=examples("flexsheet scene keys", "flexsheet scene keys --json"))
+def keys(as_json: JsonOption = False) -> None:
+    """List all keys of scene files with type, unit, default and effect."""
+    from flexsheet.launch.objects.scene_keys import SceneKey, list_groups
+    from flexsheet.messages.field_types import strip_markdown
+
+    groups = {
+        group.title: [SceneKey(*map(strip_markdown, key)) for key in group.keys]
+        for group in list_groups()
+    }
+    if as_json:
+        print_json({title: [key._asdict() for key in rows] for title, rows in groups.items()})
+        return
+    for number, (title, rows) in enumerate(groups.items()):
+        if number:
+            print()
+        print(title)
+        print_table(SceneKey._fields, rows)
 
 
 @app.command(

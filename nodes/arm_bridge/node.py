@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     Arming,
@@ -179,8 +180,8 @@ class ArmBridge(Node):
         doing = f"{control.mode} {control.reason}".rstrip()
         self.note = doing
         if self._failures:
-            self.note += f"; failed exchanges with the controller: {self._failures}"
-            self.note += " (two in a row stop the arm)"
+            counted = f"{self._failures} {NodeNote.FAILED_EXCHANGES.phrase}"
+            self.note += f"; {counted} (two in a row stop the arm)"
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
             state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)

@@ -9,6 +9,7 @@ from threading import Event
 from typing import Any, ClassVar, TypeVar
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, ParameterChange, Skin, SoftBody
 from flexsheet.nodes import OmissionReason, cache
@@ -103,7 +104,8 @@ class FemSolver(Node):
             for depth_m in body.NOTED_DEPTHS_M
         )
         return (
-            f"{current.method.name}, force error up to {errors} depth relative to the reference, "
+            f"{current.method.name}, {NodeNote.FORCE_ERROR.phrase} {errors} depth relative to the "
+            "reference, "
             f"{nodes} skin nodes"
         )
 

@@ -19,6 +19,7 @@ from pydantic import Field
 
 from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
 from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
@@ -342,7 +343,8 @@ class TwinFingerNode(Node):
         self.twin__stereo.publish(pair, source_ns=middle_ns)
         parts = [f'path "{self.path_label}"'] if self.path_label else []
         if self.missed_frames:
-            parts.append(f"{self.missed_frames} frames missed because the computer was busy")
+            missed = f"{self.missed_frames} {NodeNote.FRAMES_MISSED.phrase}"
+            parts.append(f"{missed} because the computer was busy")
         if self.parameters.hand == "coupled" and self.coupled is None:
             parts.append("the force of the sheet on the finger is being computed")
         self.note = ", ".join(parts)
