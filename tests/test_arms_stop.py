@@ -120,7 +120,7 @@ def test_a_tool_that_holds_the_endpoint_does_not_hinder_a_stop(graph: Graph) -> 
     assert ("launcher", "launch", "confirmed") in outcomes(answer)
     assert all(one["mode"] == "estop" for one in answer["arms"])
     assert all(REASON in one["faults"][0] for one in answer["arms"])
-    assert "e-stop of tools, latched until it is reset" in graph.log()
+    assert f"e-stop of tools, latched until it is reset: {REASON}" in graph.log()
 
 
 @pytest.mark.usefixtures("holder")

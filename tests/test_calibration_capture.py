@@ -399,7 +399,7 @@ def test_images_are_taken_from_the_camera_source(
         ),
         (("--twin", "SCENE", "--pictures", "."), "name a new folder"),
         (("--twin", "SCENE", "--marker-mm", "40"), "do not fit"),
-        (("--twin", "nowhere.yaml"), "cannot be read"),
+        (("--twin", "nowhere.yaml"), "does not exist"),
     ],
 )
 def test_errors_name_a_remedy(

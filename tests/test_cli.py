@@ -139,7 +139,7 @@ def test_help_names_every_command(flexsheet: Command) -> None:
 
 def test_help_and_the_table_of_topics_load_no_heavy_library() -> None:
     code = (
-        "import sys; sys.argv = ['flexsheet', 'topic', 'list', '--json']\n"
+        "import sys; sys.argv = ['flexsheet', 'topic', 'list', '--all', '--json']\n"
         "from flexsheet.__main__ import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
@@ -154,14 +154,32 @@ def test_help_and_the_table_of_topics_load_no_heavy_library() -> None:
 
 
 def test_topic_list_is_the_table(flexsheet: Command) -> None:
-    rows = flexsheet("topic", "list", "--json").json()
+    rows = flexsheet("topic", "list", "--all", "--json").json()
     assert [row["topic"] for row in rows] == list(TOPICS)
     assert {row["topic"]: row["expected_rate_hz"] for row in rows}["stereo"] == [30, 130]
-    heading, *lines = flexsheet("topic", "list").out.splitlines()
+    heading, *lines = flexsheet("topic", "list", "--all").out.splitlines()
     assert heading.split()[:4] == ["topic", "message", "delivery", "expected_rate_hz"]
     shown = {line.split()[0]: line.split()[3:5] for line in lines}
     assert shown["stereo"][0] == "30-130"
     assert shown["twin/finger_path"] == ["on", "change"]
+
+
+def test_topic_list_contains_the_topics_of_the_running_graph(
+    flexsheet: Command, running: Path
+) -> None:
+    listed = [row["topic"] for row in flexsheet("topic", "list", "--json").json()]
+    assert {"twin/finger", "estop", "status"} <= set(listed)
+    assert not {"stereo", "twin/eye", "clocks"} & set(listed)
+    assert listed == [topic for topic in TOPICS if topic in listed]
+
+
+def test_topic_list_without_a_graph_contains_all_topics(
+    flexsheet: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path))
+    printed = flexsheet("topic", "list", "--json")
+    assert [row["topic"] for row in printed.json()] == list(TOPICS)
+    assert "all defined topics follow" in printed.err
 
 
 def test_node_types_and_info(flexsheet: Command) -> None:
@@ -381,10 +399,29 @@ def test_launch_prints_the_address_of_the_console_once(
     assert printed.err.count(f"console: http://127.0.0.1:{port}/") == 1
 
 
+def test_launch_prints_why_a_node_is_not_started(
+    flexsheet: Command, runs_root: Path, tmp_path: Path
+) -> None:
+    values = {
+        "scene": str(Path("launch/scenes/rigid-plane.yaml").resolve()),
+        "nodes": {**GRAPH["nodes"], "fem_solver": {"type": "fem_solver"}},
+    }
+    printed = flexsheet("launch", write(tmp_path, values), "--duration", "0.1")
+    assert printed.code == 0, printed.err
+    assert "fem_solver is not started: the scene's object is rigid: it has no mat" in printed.err
+
+
 def test_logs_print_the_log_of_a_node(flexsheet: Command, running: Path) -> None:
     lines = flexsheet("logs", "recorder", "--json").out.splitlines()
     assert any(json.loads(line)["event"] == "recording" for line in lines)
     assert len(flexsheet("logs", "recorder", "-n", "1").out.splitlines()) == 1
+    printed = flexsheet("logs", "recorder", "-n", "0")
+    assert (printed.code, printed.out, printed.err) == (0, "", "")
+    run = runs.list_live_runs()[0]
+    (run.logs / "silent.log").touch()
+    printed = flexsheet("logs", "silent")
+    assert (printed.code, printed.out) == (0, "")
+    assert printed.err == "the log of silent has no entries\n"
     printed = flexsheet("logs", "recordr")
     assert (printed.code, 'did you mean "recorder"?' in printed.err) == (2, True)
 
@@ -397,6 +434,10 @@ def test_a_parameter_is_read_and_changed_in_the_running_graph(
     assert not rows["beacon.rate_hz"]["live"]
     assert flexsheet("param", "set", "listener.patience_s", "2.5", "--json").json()["value"] == 2.5
     assert flexsheet("param", "get", "listener.patience_s").out == "2.5\n"
+    lines = flexsheet("param", "list").out.splitlines()
+    assert lines[0].split() == ["parameter", "value", "live"]
+    recorded = next(line for line in lines if line.startswith("recorder.topics "))
+    assert "null" in recorded or "[" in recorded
 
 
 @pytest.mark.parametrize(

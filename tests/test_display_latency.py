@@ -230,7 +230,7 @@ def test_the_latency_goes_to_the_renderer_in_a_common_clock(
     before = load_graph(tmp_path / "launch.yaml").nodes["renderer"].parameters
     assert nodes["renderer"].parameters["display_latency_s"] == before["display_latency_s"]
     figures: dict[str, Any] = {"predicted": {}, "flagged": []}
-    doubts = list_doubts(lab.state.steps, figures, (0.2, 0.5))
+    doubts = list_doubts(lab.state.steps, figures, (0.2, 0.5), "flexsheet commission --check")
     assert doubts == [f"step delays: display_latency was not measured: {missing.reason}"]
     assert missing.reason in (lab.folder / REPORT_FILE).read_text()
     (row,) = summarize(lab)["steps"]

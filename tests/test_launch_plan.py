@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.plans.documents import BadInputError, parse_value
-from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.documents import BadInputError, did_you_mean, parse_value
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.plans.routing import FIRST_PORT, PORT_COUNT, _assign_ports
 
@@ -192,11 +192,6 @@ def test_all_errors_are_reported_at_once(tmp_path: Path) -> None:
     assert len(caught.value.problems) == 3
 
 
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="cannot be read"):
-        load_graph(tmp_path / "no.yaml")
-
-
 def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
     scene = (ROOT / "launch/scenes/cylinder.yaml").read_text()
     line = next(i for i, text in enumerate(scene.splitlines(), 1) if "interocular_m" in text)
@@ -212,6 +207,7 @@ def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
     [
         ("beacon", "write node.parameter=value"),
         ("beacn.rate_hz=3", 'unknown node "beacn"; did you mean "beacon"?'),
+        ("beacon.rate=3", 'unknown key "rate"; did you mean "rate_hz"?'),
         ("beacon.rate=3", '--set beacon.rate=3: nodes.beacon.parameters.rate: unknown key "rate"'),
         ("beacon.rate_hz=slow", "--set beacon.rate_hz=slow: nodes.beacon.parameters.rate_hz"),
         ("beacon.rate_hz.deep=3", "is not a mapping"),
@@ -328,10 +324,19 @@ nodes:
     assert plan.scene_file == str(ROOT / "launch/scenes/organ.yaml")
 
 
+def test_a_name_without_file_lists_the_shipped_files(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=r'exist; did you mean "demo"\? Shipped launch files: '):
+        load_graph(tmp_path / "demmo")
+    with pytest.raises(BadInputError, match="check the path, or name a shipped scene: box, "):
+        load_scene(tmp_path / "nothing")
+    printed = complaint(tmp_path, "extends: demo\n", settings=["scene=sphare"])
+    assert 'does not exist; did you mean "sphere"? Shipped scenes: box, ' in printed
+
+
 @pytest.mark.parametrize(
     ("text", "printed"),
     [
-        ("extends: demmo\n", 'graph.yaml:1: extends: "demmo" does not exist; name a file, or a'),
+        ("extends: demmo\n", 'graph.yaml:1: extends: "demmo" does not exist; did you mean "demo"?'),
         ("extends: graph.yaml\n", "graph.yaml:1: extends: "),
         ("extends: demo\nscene: nowhere\n", 'graph.yaml:2: scene: "nowhere" does not exist'),
         ("extends: demo\nnodes: {planner: {nise: 1}}\n", "graph.yaml:2: nodes.planner.nise: unkno"),
@@ -354,7 +359,7 @@ def test_an_error_in_an_extended_file_names_that_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("type_name", "remedy"),
     [
-        ("no.such:Thing", "run the command in the folder that contains no/such.py, add that"),
+        ("no.such:Thing", "PYTHONPATH=FOLDER before the command, where FOLDER contains no/such.py"),
         ("tests.launch_nodes:Thing", "define the class Thing in tests.launch_nodes"),
     ],
 )
@@ -420,3 +425,10 @@ def test_the_launch_file_can_let_others_into_the_process_of_a_bridge(tmp_path: P
     plan = load_graph(write(tmp_path, text.replace(BRIDGE, f"{BRIDGE}, shares_arm_process: true")))
     [shared] = [one for one in plan.processes_on("main") if one.name == "arm"]
     assert [node.name for node in shared.nodes] == ["twin_arms", "bridge", "beacon"]
+
+
+def test_a_name_without_unit_is_completed() -> None:
+    known = ["speed_m_per_s", "spin", "turn_rad_per_s", "turn_jerk_rad_per_s3"]
+    assert did_you_mean("speed", known) == 'did you mean "speed_m_per_s"?'
+    assert did_you_mean("turn", known).startswith("choose one of: ")
+    assert did_you_mean("spine", known) == 'did you mean "spin"?'

@@ -24,6 +24,18 @@ def test_progress_is_printed_in_lines_where_stderr_is_no_terminal(
     assert err.splitlines() == ["replaying: 30 %", "replaying: 60 %"]
 
 
+def test_a_progress_bar_prints_nothing_in_a_dumb_terminal_if_it_is_short(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(output, "words", output.Words())
+    assert output.words.console.is_terminal
+    with output.progress_bar("detecting the board") as progress:
+        progress(1, 2)
+    assert capsys.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize(("count", "words"), [(1, "1 graph is running"), (2, "2 graphs are")])
 def test_the_number_of_graphs_agrees_with_the_verb(
     count: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

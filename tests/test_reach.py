@@ -372,6 +372,25 @@ def test_the_largest_reachable_tilt_is_proposed() -> None:
     assert not all(reached)
 
 
+def test_the_reach_is_reported_before_the_search_for_remedies(
+    flexsheet: Command, barred: Layout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+    monkeypatch.setattr(layout, "_check_reach", lambda *_: barred)
+    monkeypatch.setattr(layout, "_is_reachable", lambda scene: scene.working_range.tilt_rad < 0.1)
+    found = check_layout(
+        SCENE, progress=steps.append, on_reach=lambda one: steps.append(f"reach {one.reachable}")
+    )
+    assert steps[:2] == ["finding the contacts on the object", "reach False"]
+    tilts = [step for step in steps if "largest tilt_rad" in step]
+    assert re.fullmatch(r"searching the largest tilt_rad: [\d.]+, test 1 of at most \d", tilts[0])
+    assert len(tilts) <= int(tilts[-1][-1])
+    assert any("tilt_rad" in remedy.values for remedy in found.remedies)
+    code, _, err = flexsheet("doctor", "scene", SCENE_FILE)
+    assert code == 1
+    assert re.search(r"^not reachable: the arms reach \d+\.\d % of the working range", err, re.M)
+
+
 def test_a_speed_that_is_too_high_gives_a_warning_and_the_largest_speed(
     flexsheet: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -442,6 +461,9 @@ def test_the_command_fails_and_offers_a_remedy(
     assert code == 1
     assert re.search(r"^reachable +NO$", out, re.M)
     assert "remedy: move the left base by" in out
+    assert re.search(r"^arm +limit +minimum margin +at tilt +depth$", out, re.M)
+    assert re.search(r"^left arm's joint solution +shoulder front, elbow ", out, re.M)
+    assert "% used" not in out
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,7 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
-from flexsheet.launch.commands.output import CommandError
-from flexsheet.launch.commands.tune import NOT_MET
+from flexsheet.launch.commands.output import NOT_GOOD, CommandError
 from flexsheet.launch.methods import tune
 from flexsheet.launch.methods.results import describe_load
 from flexsheet.launch.methods.tune import (
@@ -425,7 +424,7 @@ def test_an_insufficient_method_has_a_separate_exit_code(
     missed = choice_of([point("cheap", 2.0)])
     monkeypatch.setattr(tune, "tune", lambda *_, **__: [missed])
     outcome = run(SCENES / "demanding.yaml", "--dry-run", "--runs", "0")
-    assert outcome.exit_code == NOT_MET
+    assert outcome.exit_code == NOT_GOOD
     assert "no method meets the tolerance 1 mm; best is cheap" in outcome.output
     assert "no file written" in outcome.output
 

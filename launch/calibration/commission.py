@@ -436,6 +436,12 @@ def format_verdict(state: State) -> list[str]:
     return lines
 
 
+def is_good(state: State) -> bool:
+    """Return whether the laboratory is verified without a doubt."""
+    figures = _verification_figures(state)
+    return bool(figures) and not figures.get("doubts")
+
+
 def _format_figures(figures: Mapping[str, Any]) -> list[str]:
     """Return Markdown tables with the main figures of the verification.
 
@@ -512,19 +518,23 @@ def _find_measured_errors(figures: Mapping[str, Any]) -> dict[str, float]:
 
 
 def list_doubts(
-    steps: Mapping[StepName, StepRecord], figures: Mapping[str, Any], tracking: tuple[float, float]
+    steps: Mapping[StepName, StepRecord],
+    figures: Mapping[str, Any],
+    tracking: tuple[float, float],
+    check_command: str,
 ) -> list[str]:
     """Return the reasons why a laboratory may exceed a tolerance; empty if there are none.
 
     figures: results of the step "verification".
     tracking: error (mm) of the sheet during the stroke as the devices report it, and its tolerance
         (mm).
+    check_command: command line that repeats the verification.
     """
     doubts = []
     if figures.get("overloaded"):
         doubts.append(
-            "the computer was overloaded during the verification; run flexsheet commission --check "
-            "on an idle computer"
+            f"the computer was overloaded during the verification{_describe_effects(figures)}; run "
+            f"on an idle computer: {check_command}"
         )
     for name, record in steps.items():
         if name is StepName.VERIFICATION:
@@ -551,6 +561,18 @@ def list_doubts(
             f"{tracking[1]:.3g} mm"
         )
     return doubts
+
+
+def _describe_effects(figures: Mapping[str, Any]) -> str:
+    """Describe the latency and the lost messages during the stroke, in parentheses."""
+    stroke = figures.get("stroke", {})
+    effects = []
+    latency_ms = stroke.get("latency_ms", {}).get("exposure_to_frame", {}).get("p50")
+    if latency_ms is not None:
+        effects.append(f"median latency from exposure to frame {latency_ms:.0f} ms")
+    if drops := stroke.get("drops"):
+        effects.append(f"{drops} lost or refused messages")
+    return f" ({', '.join(effects)})" if effects else ""
 
 
 def list_limits(state: State) -> list[str]:

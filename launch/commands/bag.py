@@ -15,7 +15,7 @@ from flexsheet.launch.commands.graph import run_interruptible, run_node_here, ru
 from flexsheet.launch.commands.launching import print_omitted
 from flexsheet.launch.commands.output import (
     FAILED,
-    OTHER_THAN_LIVE,
+    NOT_GOOD,
     CommandError,
     examples,
     logs_on_stderr,
@@ -332,7 +332,7 @@ def verify(
     if not result.repeatable:
         raise typer.Exit(FAILED)
     if not result.as_live:
-        raise typer.Exit(OTHER_THAN_LIVE)
+        raise typer.Exit(NOT_GOOD)
 
 
 @app.command(

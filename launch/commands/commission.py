@@ -11,6 +11,7 @@ import typer
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     FAILED,
+    NOT_GOOD,
     CommandError,
     examples,
     print_json,
@@ -127,9 +128,10 @@ def commission(
     The steps are camera, arms, edges, sheet, projector, marker, eyes, delays and verification.
     Finished steps are not repeated. With --apparatus, all devices are simulated, and the steps take
     a few minutes. Otherwise, if the data of a step are missing, the command states how to capture
-    them and stops with exit code 1.
+    them and stops with exit code 1. The exit code is 3 if the laboratory is not good or not
+    verified.
     """
-    from flexsheet.launch.calibration.commission import MissingDataError, StepName
+    from flexsheet.launch.calibration.commission import MissingDataError, StepName, is_good
     from flexsheet.launch.commands.calibrate import FOUR_BITS, parse_board
     from flexsheet.launch.commands.commission_steps import open_laboratory
 
@@ -182,6 +184,8 @@ def commission(
     _print_result(lab, missing, as_json)
     if missing is not None:
         raise typer.Exit(FAILED)
+    if not is_good(lab.state):
+        raise typer.Exit(NOT_GOOD)
 
 
 def _parse_step(option: str, text: str) -> StepName:

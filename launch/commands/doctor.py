@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,9 @@ from flexsheet.launch.commands.output import (
     progress_words,
     words,
 )
+
+if TYPE_CHECKING:
+    from flexsheet.launch.health.layout import Layout
 
 app = typer.Typer(
     add_completion=False,
@@ -94,13 +97,17 @@ def check_scene(
     maximum stretch of the sheet. It prints the maximum finger speed that the arms can follow. The
     exit code is 1 if the arms cannot reach a sample. If they reach all samples but are too slow, a
     warning is printed.
+
+    In the joint solution of an RV-1A or RV-2FR, shoulder front means that the wrist centre is in
+    front of the plane through the axes of J1 and J2. Elbow up means that J3 is above the angle of
+    the straight arm, and wrist flipped means that J5 is negative.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
     with progress_words() as progress:
-        layout = check_layout(scene, progress=progress)
+        layout = check_layout(scene, progress=progress, on_reach=_print_reach)
     result = make_layout_result(layout)
     if output is not None:
         try:
@@ -118,10 +125,19 @@ def check_scene(
         raise typer.Exit(FAILED)
 
 
+def _print_reach(layout: Layout) -> None:
+    """Print that the working range is not reachable, before the long search for remedies."""
+    if not layout.reachable:
+        words.print(
+            f"not reachable: the arms reach {100 * layout.reached.mean():.1f} % of the working "
+            "range; searching for remedies, which can take minutes (Ctrl-C ends the search)"
+        )
+
+
 def _describe_branch(branch: dict[str, Any]) -> str:
     """Describe a joint solution by its names, or by its joint angles in degrees."""
     if "seed_rad" not in branch:
-        return ", ".join(branch.values())
+        return ", ".join(f"{part} {value}" for part, value in branch.items())
     degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])
     return f"joints near ({', '.join(degrees)}) degrees"
 
@@ -137,7 +153,10 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
                 f"{100 * result['fraction']:.1f} % of {result['samples']}, "
                 + ", ".join(f"{side} {100 * one['fraction']:.1f} %" for side, one in arms.items()),
             ),
-            *((f"{side} branch", _describe_branch(one["branch"])) for side, one in arms.items()),
+            *(
+                (f"{side} arm's joint solution", _describe_branch(one["branch"]))
+                for side, one in arms.items()
+            ),
             (
                 "speed",
                 f"{1e3 * required_m_per_s:.0f} mm/s required; possible at all samples: "
@@ -162,18 +181,17 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
         print_table(("arm", "active limit", "samples", "first at tilt", "depth"), binding)
         print()
     print_table(
-        ("arm", "minimum margin of", "limit", "margin", "at tilt", "depth"),
+        ("arm", "limit", "minimum margin", "at tilt", "depth"),
         [
             (
                 side,
-                kind,
                 one["limit"],
                 _margin(one["margin"], one["unit"]),
                 f"{math.degrees(one['tilt_rad']):.1f}°",
                 f"{1e3 * one['depth_m']:.0f} mm",
             )
             for side, arm in arms.items()
-            for kind, one in arm["min_margins"].items()
+            for one in arm["min_margins"].values()
         ],
     )
     for path in result["blocked_paths"]:
@@ -194,6 +212,6 @@ def _margin(value: float, unit: str) -> str:
         "rad": f"{math.degrees(value):.1f}°",
         "m": f"{1e3 * value:.0f} mm",
         "N": f"{value:.1f} N",
-        "ratio": f"{100 * (1.0 - value):.0f} % used",
+        "ratio": f"{100 * value:.0f} %",
     }
     return shown[unit]

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
-FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
+FAILED, BAD_INPUT, NOT_GOOD = 1, 2, 3
+"""The exit codes of a failure, of invalid input, and of a completed command whose result is not
+good."""
 
 PROGRESS_LINE_S = 2.0
 """The minimum time (s) between two lines with the progress, if stderr is not a terminal."""
@@ -52,7 +54,8 @@ class Words:
 
     @property
     def is_terminal(self) -> bool:
-        return self.console.is_terminal
+        """Whether stderr is a terminal whose last lines can be replaced, not a dumb terminal."""
+        return self.console.is_interactive
 
     @property
     def in_colour(self) -> bool:

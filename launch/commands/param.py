@@ -74,6 +74,9 @@ def list_parameters(
         for name, value in one.parameters.items()
         if name != "apparatus"
     ]
+    if not as_json:
+        for row in rows:
+            row["value"] = json.dumps(row["value"])
     print_rows(rows, as_json=as_json)
 
 

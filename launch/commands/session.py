@@ -219,6 +219,8 @@ def logs(
     with file.open(encoding="utf-8", errors="replace") as text:
         for line in deque(text, maxlen=lines):
             show(line.rstrip("\n"))
+        if text.tell() == 0:
+            words.print(f"the log of {node} has no entries")
         if follow:
             for line in _further_lines(text, found):
                 show(line)

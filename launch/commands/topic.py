@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands.graph import (
+    NoGraphError,
     list_readers,
     receiving,
     run_interruptible,
@@ -57,17 +58,35 @@ SHORT_ARRAY = 36
 
 @app.command(
     "list",
-    epilog=examples("flexsheet topic list", "flexsheet topic list --json"),
+    epilog=examples("flexsheet topic list", "flexsheet topic list --all --json"),
 )
-def list_topics(as_json: JsonOption = False) -> None:
-    """List all topics with message type, delivery, expected rate and description.
+def list_topics(
+    list_all: Annotated[
+        bool,
+        typer.Option("--all", help="List all defined topics, also those that the graph lacks."),
+    ] = False,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the topics that have a writer or a reader in the running graph.
 
-    The expected rate is a fixed range for health checks, or "on change" for a topic without one.
-    `flexsheet topic hz TOPIC` measures the rate in the running graph.
+    Without a running graph, all defined topics are listed. The expected rate is a fixed range for
+    health checks, or "on change" for a topic without one. `flexsheet topic hz TOPIC` measures the
+    rate in the running graph.
     """
     from flexsheet.messages.topics import TOPICS
 
-    rows = [_describe(topic) for topic in TOPICS.values()]
+    topics = list(TOPICS.values())
+    if not list_all:
+        try:
+            plan, _ = running_graph(run)
+        except NoGraphError as error:
+            words.print(f"{error}; all defined topics follow")
+        else:
+            topics = [
+                one for one in topics if plan.writers.get(one.name) or list_readers(plan, one.name)
+            ]
+    rows = [_describe(topic) for topic in topics]
     if not as_json:
         for row in rows:
             rate = row["expected_rate_hz"]
@@ -406,7 +425,7 @@ def _describe(topic: Topic) -> dict[str, Any]:
         "message": topic.message.__name__,
         "delivery": str(topic.delivery),
         "expected_rate_hz": topic.rate_hz,
-        "logged": topic.logged,
+        "recorded": topic.logged,
         "many_writers": topic.many_writers,
         "max_bytes": topic.max_bytes,
         "about": topic.about,

@@ -11,6 +11,7 @@ import typer
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, output_file
 from flexsheet.launch.commands.output import (
+    NOT_GOOD,
     CommandError,
     examples,
     logs_on_stderr,
@@ -22,10 +23,6 @@ from flexsheet.launch.commands.output import (
 
 if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
-
-NOT_MET = 3
-"""The exit code if no method of a method family meets the tolerance of the scene."""
-
 
 app = make_app()
 
@@ -142,7 +139,7 @@ def tune(
         tune.write_choices(scene_file, target, choices, unmet)
     words.print("no file written (--dry-run)" if target is None else f"written: {target}")
     if not met:
-        raise typer.Exit(NOT_MET)
+        raise typer.Exit(NOT_GOOD)
 
 
 def _print_choices(choices: Sequence[Choice]) -> None:

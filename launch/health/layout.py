@@ -66,6 +66,9 @@ OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
 TILT_STEP_RAD, DEPTH_STEP_M, SPEED_STEP_M_PER_S = 0.01, 0.001, 1e-4
 """The steps between the values that are tried as remedies."""
 
+PROGRESS_STEPS = 10
+"""The maximum number of progress reports during the search for a base position."""
+
 REACHED_COLOR = "#dcefdc"
 
 THINNED_COUNT = 600
@@ -288,13 +291,20 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
     )
 
 
-def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Layout:
+def check_layout(
+    scene: Scene,
+    *,
+    progress: Progress = lambda text: None,
+    on_reach: Callable[[Layout], None] = lambda layout: None,
+) -> Layout:
     """Check whether both arms reach the working range, and search for remedies if one does not.
 
     progress: function that is called with a description of each step.
+    on_reach: function that is called with the result before the search, which can take minutes.
     """
     progress("finding the contacts on the object")
     found = _check_reach(scene, sample_contacts(scene), progress)
+    on_reach(found)
     return replace(found, remedies=tuple(_find_remedies(found, progress)))
 
 
@@ -358,8 +368,7 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
     moved: dict[Side, Floats] = {}
     for side, reach in layout.arms():
         if not reach.reachable.all():
-            progress(f"searching positions of the {side} base")
-            offset = _find_base_offset(layout, side)
+            offset = _find_base_offset(layout, side, progress)
             if offset is None:
                 moved.clear()
                 break
@@ -377,8 +386,7 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
         ("tilt_rad", TILT_STEP_RAD, "rad", 180.0 / np.pi, "degrees"),
         ("push_depth_m", DEPTH_STEP_M, "m", 1e3, "mm"),
     ):
-        progress(f"searching the largest {key}")
-        largest = _find_largest(layout.scene, key, step)
+        largest = _find_largest(layout.scene, key, step, progress)
         if largest is not None:
             yield LayoutRemedy(
                 f"working_range.{key}: at most {largest:g} {unit} ({factor * largest:.1f} {shown})",
@@ -386,16 +394,19 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
             )
 
 
-def _find_largest(scene: Scene, key: str, step: float) -> float | None:
+def _find_largest(scene: Scene, key: str, step: float, progress: Progress) -> float | None:
     """Return the largest value of one key with which the whole working range is reachable.
 
     The search is a bisection over the multiples of `step` below the value in the scene. Return None
     if no tested value is reachable.
     """
     low, high = 0, math.ceil(round(getattr(scene.working_range, key) / step, 6))
+    number, count = 0, math.ceil(math.log2(max(high, 1)))
     while high - low > 1:
+        number += 1
         middle = (low + high) // 2
         value = round(middle * step, 6)
+        progress(f"searching the largest {key}: {value:g}, test {number} of at most {count}")
         changed = scene.working_range.model_copy(update={key: value})
         if _is_reachable(scene.model_copy(update={"working_range": changed})):
             low = middle
@@ -432,7 +443,7 @@ def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
     return scene.model_copy(update={"arms": changed})
 
 
-def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
+def _find_base_offset(layout: Layout, side: Side, progress: Progress) -> Floats | None:
     """Return the smallest displacement (3,), in m, of a base that makes all samples reachable.
 
     Return None if no tested displacement is sufficient.
@@ -457,7 +468,9 @@ def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
         (np.array(one) for one in product(OFFSETS_M, repeat=3)),
         key=lambda one: (round(float(np.linalg.norm(one)), 6), *np.abs(one)),
     )
-    for offset in offsets[1:]:
+    for number, offset in enumerate(offsets[1:]):
+        if number % math.ceil(len(offsets) / PROGRESS_STEPS) == 0:
+            progress(f"searching positions of the {side} base: {100 * number // len(offsets)} %")
         arm = ArmGeometry(move_base(layout.scene, side, offset), side)
         if not find_best_reach(arm, other_arm, thin.without_twists()).reachable.all():
             continue

@@ -411,8 +411,12 @@ def _name_type(value: Any) -> str:
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """Return a text that suggests the most similar known name, or else all known names."""
-    near = get_close_matches(str(name), known, n=1)
+    """Return a text that suggests the most similar known name, or else all known names.
+
+    A known name that consists of the given name and a suffix, such as a unit, is preferred.
+    """
+    longer = [one for one in known if one.startswith(f"{name}_")]
+    near = longer if len(longer) == 1 else get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
     return f"choose one of: {', '.join(known)}" if known else "none is defined"

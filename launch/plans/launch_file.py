@@ -16,7 +16,7 @@ from flexsheet.launch.plans.documents import (
     read_document,
 )
 from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
-from flexsheet.launch.plans.shipped import LAUNCH_FILES, find_file, list_shipped
+from flexsheet.launch.plans.shipped import LAUNCH_FILES, find_file, name_shipped
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
 
@@ -156,6 +156,10 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     extending: files that extend this file, directly or indirectly, to detect circular references.
     Raises BadInputError if a file is invalid.
     """
+    if not path.exists():
+        raise BadInputError.single(
+            str(path), (), "the file does not exist", name_shipped(path, LAUNCH_FILES)
+        )
     document = read_document(path)
     if SCENE_KEY_SET & document.values.keys() and "nodes" not in document.values:
         raise BadInputError.single(
@@ -172,7 +176,7 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
         raise document.error(
             ("extends",),
             f'"{name}" does not exist',
-            f"name a file, or a shipped launch file: {', '.join(list_shipped(LAUNCH_FILES))}",
+            name_shipped(name, LAUNCH_FILES),
         )
     chain = (*extending, path.resolve())
     if base.resolve() in chain:

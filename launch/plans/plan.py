@@ -61,7 +61,7 @@ from flexsheet.launch.plans.routing import (
     make_endpoints,
     resolve_further_inputs,
 )
-from flexsheet.launch.plans.shipped import SCENES, find_file, list_shipped
+from flexsheet.launch.plans.shipped import SCENES, find_file, name_shipped
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.node import NodeParameters, find_role
@@ -165,11 +165,10 @@ def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, 
         return None, None
     path = find_file(spec.scene, SCENES, document.folder(("scene",)))
     if not path.is_file():
-        names = ", ".join(list_shipped(SCENES))
         document.report(
             ("scene",),
             f'"{spec.scene}" does not exist',
-            f"create {path}, or name a shipped scene: {names}",
+            name_shipped(path, SCENES),
         )
         return None, None
     try:
@@ -200,6 +199,10 @@ def _load_apparatus(
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file; raise BadInputError if it is invalid."""
+    if not path.exists():
+        raise BadInputError.single(
+            str(path), (), "the file does not exist", name_shipped(path, SCENES)
+        )
     return make_scene(read_document(path))
 
 

@@ -187,8 +187,8 @@ def _describe_import_remedy(type_name: str, error: Exception) -> str:
         if module == error.name or module.startswith(f"{error.name}."):
             file = f"{module.replace('.', '/')}.py"
             return (
-                f"run the command in the folder that contains {file}, add that folder to "
-                "PYTHONPATH, or install the package"
+                f"write PYTHONPATH=FOLDER before the command, where FOLDER contains {file}, or "
+                "install the package"
             )
         return f"install the module {error.name}: pip install {error.name.partition('.')[0]}"
     if isinstance(error, AttributeError):

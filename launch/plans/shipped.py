@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 
 LAUNCH_FILES = Path(__file__).resolve().parent.parent
@@ -21,3 +22,15 @@ def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
     """
     path, named = folder / given, shipped / f"{given}.yaml"
     return named if not (path.exists() or path.suffix) and named.is_file() else path
+
+
+def name_shipped(given: str | Path, shipped: Path) -> str:
+    """Return a remedy for a file that does not exist, with the names of the shipped files.
+
+    shipped: folder of shipped files, LAUNCH_FILES or SCENES.
+    """
+    names = list_shipped(shipped)
+    near = get_close_matches(Path(given).stem, names, n=1)
+    remedy = f'did you mean "{near[0]}"? Shipped' if near else "check the path, or name a shipped"
+    kind = "scene" if shipped == SCENES else "launch file"
+    return f"{remedy} {kind}{'s' if near else ''}: {', '.join(names)}"

@@ -177,7 +177,7 @@ class HostAgent:
         """Engage an e-stop that the command `flexsheet arms stop` has sent through the local
         socket."""
         writer = tools_on(self._host)
-        self._on_problem(f"e-stop of {writer}, {NodeNote.ESTOP_KEPT.phrase}")
+        self._on_problem(_describe_estop(writer, reason))
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
 
     def _latch_estop(self, estop: EStop, header: Header) -> None:
@@ -187,7 +187,7 @@ class HostAgent:
             if self._latched is not None and header.writer in self._launchers:
                 return
             if self._latched is None:
-                self._on_problem(f"e-stop of {header.writer}, {NodeNote.ESTOP_KEPT.phrase}")
+                self._on_problem(_describe_estop(header.writer, estop.reason))
             # With a timestamp in the future, every later reset would be ignored as older.
             self._engage(estop, now_ns if clock_problem else min(header.source_ns, now_ns))
         elif header.writer in self._plan.may_reset_estop() and self._latched is not None:
@@ -331,6 +331,10 @@ class HostAgent:
             cpu=self._cpu.update(watched, pids),
             nice_denied=self._nice_denied,
         )
+
+
+def _describe_estop(writer: str, reason: str) -> str:
+    return f"e-stop of {writer}, {NodeNote.ESTOP_KEPT.phrase}: {reason}"
 
 
 def make_output(

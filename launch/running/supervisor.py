@@ -29,6 +29,7 @@ from typing import Any, Self
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.launch_file import read_launch_file
+from flexsheet.launch.plans.needed_nodes import REASON_TEXTS
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.plans.plan_model import (
     LAUNCHER,
@@ -541,7 +542,7 @@ class RunningGraph:
             self._start_agent(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
         for omitted in self.plan.omitted:
-            self._report(LAUNCHER, f"{omitted.name} is not started: {omitted.reason}")
+            self._report(LAUNCHER, f"{omitted.name} is not started: {REASON_TEXTS[omitted.reason]}")
         if problem := describe_nice_problem(self.nodes):
             self._report(LAUNCHER, problem)
         for name, process in self._processes.items():
