@@ -127,7 +127,7 @@ def test_a_page_with_a_generated_table_names_the_command_that_prints_it(table: s
         "message-types": "flexsheet topic info TOPIC",
         "parameters": "flexsheet node info TYPE",
         "scene-keys": "flexsheet scene keys",
-        "topics": "flexsheet topic list",
+        "topics": "flexsheet topic list --all",
     }
     (page,) = (
         text for one in DOCS.glob("*.md") if table in INCLUDE.findall(text := one.read_text())
