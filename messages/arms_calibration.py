@@ -63,7 +63,7 @@ class ArmBase(Part):
 class ArmsCalibration(Part):
     """The calibrated poses of the bases of both arms.
 
-    An arm that was not calibrated is null.
+    If an arm was not calibrated, its field is null.
     """
 
     version: Literal[1] = 1

@@ -111,8 +111,8 @@ class BagWriter:
     power failure, slightly more may be lost.
 
     metadata: named tables of text that identify the recording (clock, hosts, git state).
-    compress: whether to compress chunks of about 1 MiB by zstd. Without compression, images are
-        written faster but need more disk space.
+    compress: whether to compress chunks of about 1 MiB with zstd. If chunks are not compressed,
+        images are written faster but need more disk space.
 
     Raises BagError if the file exists or cannot be created.
     """
@@ -489,8 +489,8 @@ class BagReader:
     def attachment(self, name: str) -> bytes:
         """Return the content of the attachment with the given name.
 
-        If several attachments have this name, return the newest one. Raises BagError if there is
-        none.
+        If several attachments have this name, the newest one is returned. Raises BagError if no
+        attachment has this name.
         """
         for one in reversed(self.attachments):
             if one.name == name:
@@ -754,7 +754,8 @@ def recover(
 ) -> RecoverReport:
     """Write the readable part of a truncated or damaged bag to a new bag.
 
-    progress: function that is called with the numbers of processed and of all chunks.
+    progress: function that is called with the number of processed chunks and the total number of
+        chunks.
 
     Raises BagError if nothing is readable, or if the new file exists or cannot be written.
     """

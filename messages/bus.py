@@ -2,12 +2,12 @@
 
 A publisher binds its socket and subscribers connect to it, in any order. Publishers and subscribers
 may be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
-calls the handler there. This design has the smallest latency of those in `benchmarks/messaging.py`.
-No `recv` is ever pending, so no cancelled `recv` can lose a message.
+calls the handler there. `benchmarks/messaging.py` compares this design with others; this design has
+the smallest latency. No `recv` is ever pending, so no cancelled `recv` can lose a message.
 
 A subscriber has one socket per host, which identifies the host of each message. From each host, the
 subscriber accepts only messages of the nodes that run there. Sockets that other computers can reach
-are bound and connected with keys only (`flexsheet.messages.security`).
+always use keys (`flexsheet.messages.security`).
 
 The file descriptor of a ZeroMQ socket is edge-triggered: its signal means that the state of the
 socket has changed, not that a message is ready. Any call on the socket can clear the signal. Each
@@ -174,8 +174,8 @@ class Publisher:
 
     bind: endpoints, "ipc:///path" or "tcp://address:port". "tcp://127.0.0.1:*" selects a free port.
     keys: keys of the hosts that may connect over tcp; None: tcp is bound to the loopback interface.
-    on_refused: function that is called with a text for each refused or closed connection. Without a
-        running loop, a separate thread calls the function.
+    on_refused: function that is called with a text for each refused or closed connection. If no
+        event loop is running, a separate thread calls the function.
     local: bus that passes messages to subscribers in this process without encoding. The socket is
         then used only while another process has subscribed.
     """
@@ -364,7 +364,7 @@ class Subscriber:
     connect: endpoints of all nodes that publish the topic. A node may start after the subscriber,
         and may restart.
     counts: counters of superseded, lost and rejected messages.
-    on_problem: function that is called with a text about a problem: the first rejection of each
+    on_problem: function that is called with a text about a problem: the first rejection for each
         cause, and each exception in `on_message`. Lost messages are a problem each time their
         number has doubled, except on topics with the delivery `latest`.
     on_handshake_failed: function that is called with a text for each kind of failed handshake;
@@ -545,7 +545,7 @@ class Subscriber:
             )
 
     def reject(self, error: WireError) -> None:
-        """Count a rejected message. Report only the first rejection of each cause."""
+        """Count a rejected message. Report only the first rejection for each cause."""
         self.counts.rejected += 1
         if error.cause not in self._reported_causes:
             self._reported_causes.add(error.cause)
@@ -604,7 +604,8 @@ class _Writer:
 
 
 def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
-    """Return the names of the nodes that publish at the endpoints, or None if one is unknown."""
+    """Return the names of the nodes that publish at the endpoints, or None if any name is unknown.
+    """
     known = [one.writer for one in sources if one.writer is not None]
     return frozenset(known) if len(known) == len(sources) > 0 else None
 

@@ -35,7 +35,7 @@ class CalibrationFileError(FlexsheetError, ValueError):
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
-    """Raised if a calibration belongs to another camera, sheet or device than the scene's."""
+    """Raised if a calibration was made for a camera, sheet or device that is not in the scene."""
 
     code = "calibration-mismatch"
     exit_code = 2

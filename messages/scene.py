@@ -279,7 +279,8 @@ class VirtualObject(Part):
 class SheetSpec(Part):
     """The rubber sheet, clamped at its left and right edges and free at its top and bottom edges.
 
-    The x axis points from the left to the right edge, and the y axis along the edges.
+    In the sheet frame, the x axis points from the left to the right edge, and the y axis points
+    along the edges.
     """
 
     width_m: Positive = Field(
@@ -436,8 +437,8 @@ ARM_MODELS = {arm.name: arm for arm in (RV_1A, RV_2FR)}
 class ArmSpec(Part):
     """A robot arm: its model, the pose of its base, and the pose of the sheet's edge on its flange.
 
-    In the sheet frame, x points from the left to the right edge, y along the edges, and z towards
-    the user.
+    In the sheet frame, the x axis points from the left to the right edge. The y axis points along
+    the edges, and the z axis towards the user.
     """
 
     model: Annotated[ClosedFormArm | JointChain, Field(discriminator="kind")] = Field(
@@ -497,9 +498,10 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """The parameters of the stereo camera. Each camera frame has x to the right, y down, z ahead.
+    """The parameters of the stereo camera.
 
-    The z axis is the optical axis of the camera.
+    In each camera frame, the x axis points to the right in the image, and the y axis down. The z
+    axis is the optical axis of the camera, and points forwards.
     """
 
     device: str

@@ -44,7 +44,7 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "
 class StereoPair(Message):
     """A pair of images of the stereo camera.
 
-    The source timestamp is the midpoint of the exposure. Without a common trigger of both cameras,
+    The source timestamp is the midpoint of the exposure. If the two cameras have no common trigger,
     the timestamp is the mean of the midpoints of both exposures.
     """
 
@@ -144,7 +144,7 @@ SheetReason = Literal[
 ]
 """The reason why the sheet does not follow the finger; "ok" while the sheet follows.
 
-With "concave_contact", the sheet follows the finger at a distance.
+If the reason is "concave_contact", the sheet follows the finger at a distance.
 """
 
 
@@ -357,7 +357,7 @@ class Force(Message):
 class Eye(Message):
     """The positions of the user's eyes, measured by a head tracker.
 
-    Without a head tracker, nodes use the positions in the scene.
+    If there is no head tracker, nodes use the positions in the scene.
     """
 
     valid: bool = Field(
@@ -574,7 +574,7 @@ SuspectedCause = Literal[
 ]
 """The suspected cause of a deviation between a measured and an expected value.
 
-`flexsheet.messages.notes` describes each cause. With a value that contains "or", the data cannot
+`flexsheet.messages.notes` describes each cause. If a value contains "or", the data cannot
 distinguish the two causes.
 """
 

@@ -216,7 +216,7 @@ class EtaEstimator:
         """Return the progress as text, such as "40 %, about 3 min left".
 
         done, total: numbers of steps.
-        now_s: current time.
+        now_s: current time, s.
 
         If `total` changes or `done` decreases, a new estimate starts.
         """

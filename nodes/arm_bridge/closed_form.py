@@ -1,8 +1,8 @@
 """Compute the kinematics of 6-axis arms with a spherical wrist in closed form.
 
-At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z. Joint angles are (6,) in
-radians, poses are 4x4 `base_from_flange` in metres. A branch is one of up to eight solutions of a
-pose for the joint angles. `ClosedFormArm` in the scene defines the dimensions.
+At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z. Joint angles are arrays
+(6,), in radians. Poses are 4x4 matrices `base_from_flange`, in metres. A branch is one of up to
+eight solutions of a pose for the joint angles. `ClosedFormArm` in the scene defines the dimensions.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from flexsheet.nodes.arm_bridge.joint_chain import SerialChain, UnreachableError
 from flexsheet.nodes.arrays import Floats
 
 WRIST_SINGULAR = 1e-7
-"""The value of |sin J5| below which the axes of J4 and J6 are parallel, and J4 is fixed."""
+"""The value of |sin J5| below which the axes of J4 and J6 count as parallel. J4 then stays fixed.
+"""
 
 SHOULDER_SINGULAR_M = 1e-7
 """The distance of the wrist centre from the axis of J1 below which J1 is fixed."""
@@ -314,7 +315,7 @@ class ClosedFormKinematics:
         return acos(min(1.0, max(-1.0, cosine)))
 
     def _solve_shoulder(self, out: float, height: float, q3: float) -> float:
-        """Return the angle of J2 (rad) that places the wrist centre.
+        """Return the angle of J2 (rad) that moves the wrist centre to a position.
 
         out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder.
         q3: angle of J3, rad.

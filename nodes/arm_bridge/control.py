@@ -91,7 +91,7 @@ MAX_JOINT_JUMP_RAD = 0.35
 solution of the inverse kinematics."""
 
 RELAX_DELAY_S = 0.5
-"""The time without a target or a permission to move after which the arms slacken the sheet."""
+"""The time after which the arms slacken the sheet if they have no target or must not move."""
 
 STALE_REASONS = {
     Freshness.STALLED: "the counters of its status stand still, so its joint angles are not used",
@@ -239,7 +239,7 @@ class ArmControl:
         self._state = target
 
     def on_answer_missed(self, text: str) -> bool:
-        """Record a command without an answer; return False if the previous answer is missing too.
+        """Record that a command was not answered; return False if the previous one was not either.
 
         text: reason that is shown to the operator.
         After the first missing answer, the motion continues from the unanswered command.
@@ -390,7 +390,8 @@ class ArmControl:
     def _check_interlocks(
         self, goal: Goal | None, other: OtherArm | None, clock_problem: str
     ) -> None:
-        """Disarm the arm if an interlock forbids motion; otherwise arm it with automatic arming."""
+        """Disarm the arm if an interlock forbids motion; otherwise arm it if arming is automatic.
+        """
         silent = other is None or not other.age_s <= self._timeouts.stop_after_s
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
         reason = self._find_interlock(goal, None if silent else other)
@@ -492,7 +493,10 @@ class ArmControl:
         return clock_problem if clock_problem and not self.faults else None
 
     def _wait_for_arming(self, other: OtherArm) -> Command:
-        """Return the command while an arm is not armed: stop, and then slacken the sheet."""
+        """Return the command while an arm is not armed.
+
+        The command stops the arm, and then slackens the sheet.
+        """
         self._waited_s += self._step_s
         if self.ready:
             return self._wait_for_other()
@@ -507,7 +511,7 @@ class ArmControl:
     def _wait_for_other(self) -> Command:
         """Return the command that stops this arm because the other arm is not armed.
 
-        With manual arming, this arm is disarmed if it has moved or has waited too long.
+        If arming is manual, this arm is disarmed when it has moved or has waited too long.
         """
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest

@@ -1,6 +1,6 @@
 """Convert a sheet target to the goal of the next command, and synchronize the two arms.
 
-Poses are 4x4 in the world frame.
+Poses are 4x4 matrices in the world frame.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 Joint speed, joint acceleration and tool speed are clamped. The tool speed is the maximum speed of
 the flange and of the clamped edge of the sheet. Limits of the sheet, of the distance between the
 flanges and of the workspace cannot be clamped. If such a limit is violated, a check returns a text,
-and the caller stops the arm. Joint angles are (6,) rad, poses 4x4 in metres.
+and the caller stops the arm. Joint angles are arrays (6,), in radians. Poses are 4x4 matrices, in
+metres.
 """
 
 from __future__ import annotations
