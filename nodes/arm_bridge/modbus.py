@@ -166,7 +166,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 class _Framer(FramerSocket):
     """A Modbus framer that fails the pending request if an answer cannot be decoded.
 
-    With the framer of pymodbus, the request would wait until its time-out.
+    If the driver used the framer of pymodbus, the request would wait until its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:

@@ -14,7 +14,7 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import is_rigid
 
 MAX_FUTURE_S = 0.02
-"""The tolerance for timestamps in the future, because of clock errors."""
+"""The maximum time by which a timestamp may be in the future because of clock errors."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
 """The maximum time between the camera exposures of two targets with overlapping trajectories."""

@@ -237,9 +237,11 @@ class PathChecker:
     def poll(
         self, request: PathCheckRequest | None
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
-        """Return a finished request and its result, or None; call this method in every cycle.
+        """Return a finished request and its result, or None if no check has finished since.
 
-        request: check to start unless a check is running; None if no check is necessary.
+        The caller must call this method in every cycle.
+
+        request: path whose check is started if no check is running; None if no check is necessary.
         """
         if self._running is None:
             if request is not None:

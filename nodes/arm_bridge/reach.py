@@ -1,9 +1,9 @@
 """Check whether the arms can reach many poses of the sheet, or follow a path.
 
-Two arms hold the sheet by its left and right edges. Poses of the sheet are (n, 4, 4) in the world
-with stretch ratios (n,). Joint angles are (n, 6) rad. A margin is the distance to a limit, positive
-within the limit. Margins of speeds are fractions of the limit. A branch is one of the discrete
-solutions of the inverse kinematics.
+Two arms hold the sheet by its left and right edges. An array of n poses of the sheet consists of
+world poses (n, 4, 4) and stretch ratios (n,). Joint angles are (n, 6) rad. A margin is the distance
+to a limit, positive within the limit. Margins of speeds are fractions of the limit. A branch is one
+of the discrete solutions of the inverse kinematics.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class SheetPoses:
-    """Poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
+    """World poses (n, 4, 4) of the sheet, with a stretch ratio (n,) and k twists (n, k, 6) each.
 
     twists_world: velocities (m/s, rad/s) of the sheet's centre that the arms must be able to follow
         at each pose; k may be 0.
@@ -284,9 +284,9 @@ def plan_path(
 ) -> list[PathStep]:
     """Plan a path for both arms that is straight between the given corners.
 
-    left_rad, right_rad: joint angles (6,) near those at the first corner.
-    Between two corners, the sheet rotates about one axis and its stretch changes linearly. Raises
-    PathError if the path violates a limit.
+    left_rad, right_rad: joint angles (6,) near the solution for the first corner. Between two
+        corners, the sheet rotates about one axis and its stretch changes linearly. Raises PathError
+        if the path violates a limit.
     """
     near = PathStep(corners[0], left_rad, right_rad)
     begin = _solve_both(left, right, corners[0], near, fraction=0.0)

@@ -95,7 +95,9 @@ MODES: Mapping[State, ArmMode] = {
     S.STOPPING_TAUT: "stopping",
     S.RELAX: "relax",
 }
-"""The published mode of each state. Exception: the mode is `fault` in TAUT with a latched fault."""
+"""The published mode of each state. Exception: in the state TAUT, the mode is `fault` if a fault is
+latched.
+"""
 
 Row = dict[tuple[State, Event], State | None]
 

@@ -60,7 +60,7 @@ class ImagePair:
     exposure_ns: mean of both mid-exposure times on the reader's clock; for files, the time since
         the start of the file.
     exposure_s: duration of the exposure that the device reports; None if unknown.
-    skew_s: mid-exposure time of the right image minus that of the left image.
+    skew_s: mid-exposure time of the right image minus mid-exposure time of the left image.
     regions: sensor regions of the images; None for full sensors.
     notes: remarks for the operator.
     """
@@ -204,7 +204,10 @@ def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
 
 
 def crop(images: ImagePair, regions: Regions) -> ImagePair:
-    """Crop images to sensor regions. Raises DeviceError if an image lacks a part of its region."""
+    """Crop images to sensor regions.
+
+    Raises DeviceError if an image does not contain its whole region.
+    """
     if images.regions == regions:
         return images
     parts = []

@@ -47,7 +47,7 @@ class CapturedFrame:
     """An image of one camera with two estimates of the mid-exposure time.
 
     by_arrival_ns: estimate that is based on the time of arrival.
-    by_stamp_ns: estimate that is based on the driver's timestamp; None without a timestamp.
+    by_stamp_ns: estimate that is based on the driver's timestamp; None if there is no timestamp.
     """
 
     image: Image

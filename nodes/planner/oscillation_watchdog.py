@@ -22,7 +22,7 @@ STEADY_RATIO = 0.95
 oscillation does not decay."""
 
 SUSTAINED_S = 1.5
-"""The time without decay of an oscillation after which the watchdog is triggered."""
+"""The time after which an oscillation that does not decay triggers the watchdog."""
 
 FADE_S = 0.3
 """The time in which the motion of the sheet's offset is reduced to zero."""

@@ -20,7 +20,7 @@ constant is 1.7 s."""
 
 
 class MonotonicTimestampFilter:
-    """A filter that drops fingertips with a timestamp before that of the last accepted fingertip.
+    """A filter that drops each fingertip whose timestamp is before the last accepted timestamp.
 
     After `RESTART_COUNT` consecutive late fingertips, the filter restarts, because the clock was
     then set back.

@@ -97,10 +97,10 @@ STATIONARY_TIME_S = 1.5
 """The time after which a marker that stays within STATIONARY_RADIUS_M is stationary."""
 
 TRACK_TIMEOUT_S = 1.0
-"""The time without detections after which the track of a moving marker is deleted."""
+"""The time since the last detection after which the track of a moving marker is deleted."""
 
 STATIONARY_TRACK_TIMEOUT_S = 10.0
-"""The time without detections after which the track of a stationary marker is deleted."""
+"""The time since the last detection after which the track of a stationary marker is deleted."""
 
 MIN_HITS = 3
 TENTATIVE_TRACK_TIMEOUT_S = 0.1

@@ -1,7 +1,7 @@
 """Detect the fingertip's marker in a stereo image pair.
 
-Bright blobs are detected in each image and matched to pairs. The centres of likely pairs are
-refined to subpixel accuracy and triangulated. Pairs that cannot be the marker receive a rejection
+Bright blobs are detected in each image and matched in pairs. The centres of likely pairs are
+refined to subpixel accuracy and triangulated. Pairs that cannot be the marker are rejected with a
 reason.
 """
 
@@ -43,8 +43,9 @@ SIZE_SIGMA = 0.2
 """The standard deviation of the logarithm of a blob's radius divided by the expected radius."""
 
 HEIGHT_SIGMA = 0.25
-"""The standard deviation of the logarithm of a marker's brightness in the left view divided by that
-in the right view."""
+"""The standard deviation of the logarithm of a brightness ratio: the marker's brightness in the
+left view divided by its brightness in the right view.
+"""
 
 MISFIT_SIGMA_PX = 0.5
 """The standard deviation of the distance between the two rays of an unrefined marker, projected
@@ -56,14 +57,16 @@ times the expected radius."""
 
 SIZE_SIGMAS = 3.5
 """The maximum deviation of a refined marker's radius from the expected radius, in standard
-deviations. With a larger deviation, the marker is partly occluded or merged with a bright spot."""
+deviations. If the deviation is larger, the marker is partly occluded or merged with a bright spot.
+"""
 
 MARKER_SIZE_SIGMA = 0.035
 """The relative standard deviation of the radii of manufactured markers."""
 
 STEREO_SIZE_SIGMAS = 4.5
-"""The maximum difference of a marker's radius between both views, in standard deviations. With a
-larger difference, the marker is partly occluded in one view."""
+"""The maximum difference of a marker's radius between both views, in standard deviations. If the
+difference is larger, the marker is partly occluded in one view.
+"""
 
 MAX_MOTION_DIFFERENCE_PX = 2.5
 """The maximum difference between both views in a marker's motion during the exposure."""
@@ -109,7 +112,7 @@ class BlobPair:
     """A pair of blobs in the left and the right image that may show the same marker.
 
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
-    gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 without a
+    gate_fraction: distance from the gate's centre divided by the gate's radius; 0 if there is no
         gate.
     cost: sum of the squared deviations of rays, sizes, brightness and distance from the gate's
         centre, in squared standard deviations.
@@ -438,7 +441,7 @@ def _flat_pose(
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the markers of refined pairs, sorted by cost, without wrong pairs of two markers.
+    """Return the markers of refined pairs, sorted by cost, and drop pairs of two different markers.
 
     A pair is dropped if both blobs belong to pairs with lower costs, or if one blob belongs to a
     pair with a much lower cost.

@@ -74,9 +74,10 @@ class Blob:
     """A bright blob that may be a marker. Lengths are in pixels of the searched image.
 
     centre: centroid of the blob's light.
-    radius: radius of the disc that has the same area as the pixels above half the height.
+    radius: radius of the disc that has the same area as the blob's pixels above half its `height`.
     motion: displacement (x, y) during the exposure, estimated from the second moments of the light.
-    spread: smallest second moment of the light, divided by that of a uniform disc with this radius.
+    spread: smallest second moment of the light, divided by the second moment of a uniform disc with
+        this radius.
     peak, surround: grey levels of the brightest pixel and of the surroundings.
     window: part of the image that contains the blob and its surroundings.
     """
@@ -246,7 +247,7 @@ def _make_blob(
     """Compute centre, radius, motion and spread of the blob in a window of an image part.
 
     cut: pixels of the window.
-    area: number of pixels above half the height.
+    area: number of pixels above half the blob's height (its grey levels above its surroundings).
     origin: row and column at which the part begins in the image.
     """
     rows, columns = window
@@ -295,7 +296,7 @@ MAX_SPREAD = 1.7
 class SystematicError:
     """The systematic errors of a refinement method, as standard deviations per axis.
 
-    still_px: error by the pixel grid and an uneven background.
+    still_px: error that the pixel grid and an uneven background cause.
     moving: additional error of a moving marker, as a fraction of its motion during the exposure.
     """
 
@@ -316,7 +317,10 @@ BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
 
 
 def moments(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
-    """Refine blobs to the unweighted centroid of the pixels above half the marker's height."""
+    """Refine each blob's centre to the unweighted centroid of its brighter pixels.
+
+    A pixel is used if its grey level is above half the marker's height over its surroundings.
+    """
     markers = []
     for image, blob in zip(images, blobs, strict=True):
         level = 0.5 * (blob.surround + blob.peak)
@@ -382,12 +386,15 @@ def _make_marker(
 
 
 MAX_ELLIPSE_MISFIT = 0.035
-"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height.
-The limit is smaller than for a disc, because an ellipse fits a partly covered disc well."""
+"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height
+(its grey levels above its surroundings). The limit is smaller than for a disc, because an ellipse
+fits a partly covered disc well.
+"""
 
 MAX_ODD_MISFIT = 0.03
-"""The maximum residual of a fitted ellipse that is odd about the centre, as a fraction of the
-marker's height. A partly covered disc has larger odd residuals."""
+"""The maximum odd (antisymmetric about the centre) part of the residual of an ellipse fit, as a
+fraction of the marker's height. A partly covered disc has larger odd residuals.
+"""
 
 
 def fit_flat_markers(

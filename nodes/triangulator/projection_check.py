@@ -53,16 +53,18 @@ STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
 """The speed of the marks below which positions are checked, and above which latency is checked."""
 
 MAX_DRIFT_M = 3e-4
-"""The maximum motion of a mark along the sheet's normal between frame and exposure for a check of
-the heights."""
+"""The maximum motion of a mark along the sheet's normal between frame and exposure. If a mark moves
+more, its height above the sheet is not checked.
+"""
 
 MAX_GAIN = 4.0
 """The maximum ratio of the standard deviations of the finger's estimated depth and a mark's height.
-With a larger ratio, the marks are too far from the finger, and the depth is not estimated."""
+If the ratio is larger, the marks are too far from the finger, and the depth is not estimated.
+"""
 
 
 class ProjectionCheck:
-    """The self-checks of projector, arms and finger marker by projected marks.
+    """The self-checks that use projected marks to test the projector, the arms and the marker.
 
     projector: projector of the scene; None if there is no projector.
     """
@@ -97,8 +99,8 @@ class ProjectionCheck:
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
         """Compare the bright points (3,), m, of an image pair with the expected marks.
 
-        camera_shift_m: displacement (3,) of the fixed reference marks by an error of the camera's
-            pose.
+        camera_shift_m: displacement (3,) of the fixed reference marks that an error of the camera's
+            pose causes.
         at_ns: time of the image pair.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]

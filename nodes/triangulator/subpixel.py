@@ -60,7 +60,8 @@ PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
 """The inverse variances of the parameters' starting values. The starting values only affect
-parameters without information in the pixels, such as the level of a saturated marker."""
+parameters that the pixels do not determine, such as the level of a saturated marker.
+"""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 """The lower bounds (px) on the radius and the blur of a fitted disc."""
@@ -82,7 +83,7 @@ MOTION_STEP_PX = 1.8
 """The maximum distance between the positions over which the image of a moving disc is averaged."""
 
 MIN_MOTION_PX = 2.0
-"""The minimum motion that is fitted.  A shorter motion cannot be distinguished from blur."""
+"""The minimum motion that is fitted. A shorter motion cannot be distinguished from blur."""
 
 PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
@@ -382,7 +383,8 @@ def _cut_out_discs(
 
 
 def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the grey levels (n, s s) of discs, and derivatives (n, parameters, s s).
+    """Return the grey levels (n, s s) of n discs in s x s pixels, and derivatives (n, parameters, s
+    s).
 
     found: parameters (n, parameters) of the discs. x, y: coordinates of the pixels, (1, 1, s) and
         (1, s, 1).
@@ -431,7 +433,9 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the grey levels (n, s s) of ellipses, and derivatives (n, parameters, s s).
+    """Return the grey levels (n, s s) of n ellipses in s x s pixels, and their derivatives.
+
+    The derivatives have the shape (n, parameters, s s).
 
     found: parameters (n, parameters) of the ellipses. x, y: coordinates of the pixels, (1, 1, s)
         and (1, s, 1).

@@ -25,15 +25,14 @@ HORIZON_MS = "horizon_ms"
 """The key for the prediction horizon of a benchmark case."""
 
 HORIZONS_S = (0.0, 0.02, 0.05)
-"""The prediction horizons after the exposure: no prediction, display of the frame, motion of the
-arms."""
+"""The prediction horizons: the exposure itself, the display of the frame, and the arms' motion."""
 
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
 """The maximum ratio of a path's speed to the scene's speed. The ratio permits tremor."""
 WITHOUT_VELOCITY = ("none",)
-"""The methods without an estimate of velocity, which cannot predict a moving finger."""
+"""The methods that do not estimate the velocity, and so cannot predict a moving finger."""
 
 
 @dataclass(frozen=True, slots=True)

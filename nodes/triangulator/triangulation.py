@@ -82,7 +82,7 @@ class StereoGeometry:
         return project_with_jacobian(point, self.matrices[view], self.distortions[view])
 
     def undistort(self, view: int, pixel: Floats) -> tuple[float, float] | None:
-        """Return the undistorted normalized coordinates of a pixel (2,); None if it is invalid.
+        """Return the undistorted normalized coordinates of a pixel (2,), or None if it is invalid.
 
         view: 0 for the left camera, 1 for the right camera.
         """
@@ -300,8 +300,7 @@ def measure(
     """Triangulate a marker from its pixels (2,) in both views.
 
     covariance: covariance (2, 2), px^2, of the left pixel.
-    right_covariance: covariance (2, 2), px^2, of the right pixel; None if equal to that of the left
-        pixel.
+    right_covariance: covariance (2, 2), px^2, of the right pixel; None if it equals `covariance`.
 
     Both views have equal weights. The covariances are therefore propagated by (J^T J)^-1 J^T, with
     the Jacobian J of the four pixel coordinates with respect to the point.
