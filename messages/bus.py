@@ -604,8 +604,7 @@ class _Writer:
 
 
 def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
-    """Return the names of the nodes that publish at the endpoints, or None if one is unknown.
-    """
+    """Return the names of the nodes that publish at the endpoints, or None if one is unknown."""
     known = [one.writer for one in sources if one.writer is not None]
     return frozenset(known) if len(known) == len(sources) > 0 else None
 

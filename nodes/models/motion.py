@@ -149,7 +149,7 @@ class EdgeBound:
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
         """Return the factor (0 to 1) by which both speeds of the sheet must be multiplied.
 
-        With this factor, no point of the edges exceeds the limit.
+        At the reduced speeds, no point of the edges exceeds the limit.
         """
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge

@@ -55,7 +55,7 @@ targets."""
 
 HISTORY = 256
 MIN_COMMANDS = 4
-"""The minimum number of recorded commands for the use of a measurement."""
+"""The minimum number of recorded commands that is required to use a measurement."""
 
 MIN_STEP_S = 0.02
 """The minimum time between two measurements that are used, s.

@@ -16,9 +16,9 @@ from flexsheet.nodes.models.one_euro import OneEuro
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The state of a filter at the time `at_ns`, and a covariance.
+    """The state of a filter at the time `at_ns`, and the covariance that belongs to it.
 
-    Each tracking method defines the shapes of both arrays.
+    Each tracking method defines the shapes of `state` and `covariance`.
     """
 
     at_ns: int

@@ -319,7 +319,7 @@ BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
 def moments(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
     """Refine each blob's centre to the unweighted centroid of its brighter pixels.
 
-    A pixel is used if its grey level is above half the marker's height over its surroundings.
+    A pixel is used if its grey level is above the mean of `Blob.peak` and `Blob.surround`.
     """
     markers = []
     for image, blob in zip(images, blobs, strict=True):

@@ -59,8 +59,9 @@ SPACING_RATIO = 1.0 / 3.0
 """The minimum distance between jets (local quadratic fits) on the same side of the surface, divided
 by the smoothing length `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""The minimum cosine of the angle between the normal of a local quadratic fit (jet) and that of a
-vertex that is used for the fit."""
+"""The minimum cosine of the angle between the normal of a local quadratic fit (jet) and the normal
+of a vertex that is used for the fit.
+"""
 MAX_CURVATURE_RATIO = 2.0
 """The maximum curvature (1/m) of a local quadratic fit (jet), multiplied by the smoothing length
 `rho` (m)."""
@@ -119,8 +120,8 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
     vertices (v, 3): positions, m.
     triangles (t, 3): indices of vertices.
 
-    With a shorter length, users would feel the facets. With a longer length, curved parts would be
-    flattened.
+    If the length were shorter, users would feel the facets. If it were longer, curved parts would
+    be flattened.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
@@ -136,8 +137,8 @@ class SmoothMeshShape:
         vertices_m (v, 3), triangles (t, 3): mesh.
         smoothing_m: smoothing length, m.
 
-        Raises MeshError for a mesh that does not bound a solid, or that is too small for the
-        smoothing length. Raises ValueError for a smoothing length that is not positive.
+        Raises MeshError if the mesh does not bound a solid, or is too small for the smoothing
+        length. Raises ValueError if the smoothing length is not positive.
         """
         check_positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
@@ -454,8 +455,8 @@ class SmoothMeshShape:
         """Return the index of the jet (local quadratic fit) nearest to a point (3,), and nearby
         jets.
 
-        The k jets with a weight near the point are given by indices (k,), centres (k, 3), normals
-        (k, 3) and shape operators (k, 3, 3).
+        The k jets whose weights are not zero near the point are given by indices (k,), centres (k,
+        3), normals (k, 3) and shape operators (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -533,7 +534,7 @@ def _put(
     """Replace rows of `feet` by rows of `other`, in place.
 
     rows: indices of the replaced rows.
-    chosen: selects the rows of `other`.
+    chosen: mask or slice that selects the rows of `other`.
     """
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]

@@ -214,7 +214,7 @@ def triangle_normals(vertices: Floats, triangles: Indices) -> Floats:
 
 
 def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return unit normals (v, 3) at the vertices, which approximate those of a smooth surface.
+    """Return unit normals (v, 3) at the vertices, as if the mesh were a smooth surface.
 
     A normal is the mean of the adjacent triangles' normals, weighted by the triangles' angles at
     the vertex (Thürmer and Wüthrich, 1998).
@@ -233,7 +233,7 @@ def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
 def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
     """Return the edges (e, 2) of a closed mesh, and the angles (e,), in rad, at these edges.
 
-    The angle is that between the normals of the two triangles.
+    The angle at an edge is the angle between the normals of its two triangles.
     """
     normal, count = triangle_normals(vertices, triangles), len(triangles)
     first, second = _neighbours(triangles)
@@ -243,7 +243,10 @@ def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats
 
 
 def volume_m3(vertices: Floats, triangles: Indices) -> float:
-    """Return the volume (m^3) that a closed mesh encloses; negative for clockwise triangles."""
+    """Return the volume (m^3) that a closed mesh encloses.
+
+    The result is negative if the triangles are clockwise when seen from outside.
+    """
     corners = vertices[triangles] - vertices[triangles].mean(axis=(0, 1))
     return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
@@ -253,7 +256,7 @@ def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tup
     triangles.
 
     A long edge is halved in both adjacent triangles, so a closed mesh remains closed. Raises
-    MeshError if there are more than `MAX_TRIANGLES`.
+    MeshError if the result has more than `MAX_TRIANGLES` triangles.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
@@ -335,8 +338,8 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
     centre (n, 3), radius (n,): spheres, m.
 
-    Spheres of similar size are searched together, because the search radius must be that of the
-    largest sphere.
+    Spheres of similar size are searched together, because the largest sphere determines the search
+    radius.
     """
     from scipy.spatial import cKDTree
 

@@ -22,7 +22,7 @@ The factor is above 1 because the clamps prevent the sheet from narrowing. The f
 SAG_PROFILE = (0.9635, 0.23, 1.96)
 """The coefficients a, b, c of the profile a + b v^2 + c v^4 of the sag over v = y / height.
 
-The profile is the ratio of the sag to that of a sheet with uniform tension. Free edges sag more
+The profile is the ratio of the sag to the sag of a sheet with uniform tension. Free edges sag more
 than the centre. The formula is within 1 % of membrane finite elements for a square sheet with
 stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
 """
