@@ -390,7 +390,10 @@ class ArmControl:
     def _check_interlocks(
         self, goal: Goal | None, other: OtherArm | None, clock_problem: str
     ) -> None:
-        """Disarm the arm if an interlock forbids motion. Otherwise, arm it if `auto_arming` is set."""
+        """Disarm the arm if an interlock forbids motion.
+
+        Otherwise, arm the arm if `auto_arming` is true.
+        """
         silent = other is None or not other.age_s <= self._timeouts.stop_after_s
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
         reason = self._find_interlock(goal, None if silent else other)

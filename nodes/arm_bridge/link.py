@@ -52,7 +52,7 @@ class ArmRefusedError(ArmLinkError):
 
 
 class ArmAnswerError(ArmLinkError):
-    """An error for an answer that is damaged, uses another protocol, or belongs to another command."""
+    """An error for an answer that is damaged, of an unknown protocol, or to another command."""
 
     code = "arm-answer"
     remedy = (
@@ -237,7 +237,7 @@ class ConnectedLink(ABC):
         """Close the connection if it is open."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether an exchange may be attempted now. After a failure, a pause is necessary."""
+        """Return whether an exchange may be attempted now; after a failure, a pause follows."""
         return self.connected or now_ns >= self._try_again_ns
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:

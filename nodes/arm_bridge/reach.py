@@ -284,9 +284,10 @@ def plan_path(
 ) -> list[PathStep]:
     """Plan a path for both arms that is straight between the given corners.
 
-    left_rad, right_rad: joint angles (6,) near the solution for the first corner. Between two
-        corners, the sheet rotates about one axis and its stretch changes linearly. Raises PathError
-        if the path violates a limit.
+    left_rad, right_rad: joint angles (6,) near the solution for the first corner.
+
+    Between two corners, the sheet rotates about one axis and its stretch changes linearly. Raises
+    PathError if the path violates a limit.
     """
     near = PathStep(corners[0], left_rad, right_rad)
     begin = _solve_both(left, right, corners[0], near, fraction=0.0)

@@ -9,13 +9,11 @@ from flexsheet.nodes.arrays import Floats
 
 STANDSTILL_COUNT = 5
 """The number of consecutive unchanged measurements after which an arm is at rest if it has reached
-its last command.
-"""
+its last command."""
 
 SETTLED_COUNT = 100
 """The number of consecutive unchanged measurements after which an arm is at rest if it has not
-reached its last command. The number is sufficient for measurements that lag by 0.7 s.
-"""
+reached its last command. The number is sufficient for measurements that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
 """The maximum difference between measurements that count as unchanged: 200 times the encoder
@@ -30,8 +28,7 @@ JUMP_MARGIN_RAD = 0.002
 
 JUMP_SPEED_RAD_PER_S = 0.5
 """The maximum plausible joint speed of an arm that is not commanded to move. The operator may move
-the arm with the teach pendant.
-"""
+the arm with the teach pendant."""
 
 OVERSPEED = 1.5
 """The maximum ratio of an arm's speed to its commanded speed while the arm catches up."""

@@ -96,8 +96,7 @@ MODES: Mapping[State, ArmMode] = {
     S.RELAX: "relax",
 }
 """The published mode of each state. Exception: in the state TAUT, the mode is `fault` if a fault is
-latched.
-"""
+latched."""
 
 Row = dict[tuple[State, Event], State | None]
 

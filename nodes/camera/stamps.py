@@ -13,13 +13,11 @@ MAX_FUTURE_NS = 1_000_000
 rounding."""
 MAX_AGE_NS = 1_000_000_000
 """The maximum age (ns) of a timestamp when the frame arrives. Drivers with several frame buffers
-need this time at 10 Hz.
-"""
+need this time at 10 Hz."""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
 """The tolerance for the pairing of frames, as a fraction of the frame period. If there were no
-tolerance, jitter would drop frames of cameras that expose half a period apart.
-"""
+tolerance, jitter would drop frames of cameras that expose half a period apart."""
 
 
 class StampCheck:

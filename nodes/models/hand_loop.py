@@ -50,8 +50,7 @@ are `DELAYS_S` and `BANDWIDTHS_RAD_PER_S`."""
 
 FILTER_DAMPING_RATIO = 0.5
 """The damping ratio of the filter of the finger's depth. If the ratio were larger, the control loop
-would be unstable at smaller sheet offsets.
-"""
+would be unstable at smaller sheet offsets."""
 
 
 @dataclass(frozen=True, slots=True)

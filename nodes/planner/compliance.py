@@ -67,14 +67,12 @@ TARGET_ERROR_RATIO = 0.10
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
 """The smallest relative differences of stiffness that users notice. The first value applies if the
 skin deforms (Bergmann Tiest & Kappers 2009). The second applies if users can compare neither work
-nor final force (Tan et al. 1995).
-"""
+nor final force (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
 """The maximum advance of the sheet towards the finger per depth of the push. At this value, the
 sheet feels 1.5 times as stiff as without an advance. The bounds for a stable loop with the hand are
-usually lower.
-"""
+usually lower."""
 
 SLOPE_TOLERANCE = 0.03
 """The tolerance of slopes with respect to their bounds, which contain larger safety margins."""
@@ -166,9 +164,10 @@ def make_stretch_limits(
 ) -> StretchLimits:
     """Return the limits of the stretch within the usable fraction of the scene's limits.
 
-    bounds: bounds on the slope of the offset for a stable control loop of sheet and hand. These
-        limits apply to the edge force while nothing touches the sheet. `render_force` limits the
-        additional edge force of a push.
+    bounds: bounds on the slope of the offset for a stable control loop of sheet and hand.
+
+    The limit of the edge force refers to a sheet that nothing touches. `render_force` limits the
+    additional edge force of a push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio

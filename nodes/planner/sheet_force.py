@@ -106,8 +106,7 @@ def compute_membrane_table(
 BENCHMARK_DEPTHS_M = (0.002, 0.005, 0.010, 0.020, 0.040)
 SLOW_DEPTHS_M = (0.005, 0.020)
 """The push depths at which slow models are benchmarked. These models are benchmarked only at the
-mean stretch and at the sheet's centre.
-"""
+mean stretch and at the sheet's centre."""
 BENCHMARK_POSITIONS: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
     ("off-centre", 0.13, 0.19),

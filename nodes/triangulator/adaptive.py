@@ -66,8 +66,7 @@ RECENT_S, RECENT_POINTS = 0.2, 10
 OUTDATED_RATIO = 1.5
 """The error ratio above which the error covariance is outdated because the motion has changed. The
 ratio is the mean square error of the weighted sum divided by the mean square error of the best
-model.
-"""
+model."""
 
 OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
 """The time constant and the minimum number of points for averaging an outdated error covariance."""
@@ -93,8 +92,7 @@ which has a relative error of about 0.1."""
 
 START_POINTS = 32
 """The number of points at the start of a track for which the Kalman gains vary with time. Later
-points use the steady-state gains.
-"""
+points use the steady-state gains."""
 
 INITIAL_SPEED_M_PER_S, INITIAL_ACCELERATION = 0.1, 1.0
 """The standard deviations of speed (m/s) and acceleration (m/s^2) at the start of a track."""

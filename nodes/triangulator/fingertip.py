@@ -44,8 +44,7 @@ SIZE_SIGMA = 0.2
 
 HEIGHT_SIGMA = 0.25
 """The standard deviation of the logarithm of a brightness ratio: the marker's brightness in the
-left view divided by its brightness in the right view.
-"""
+left view divided by its brightness in the right view."""
 
 MISFIT_SIGMA_PX = 0.5
 """The standard deviation of the distance between the two rays of an unrefined marker, projected
@@ -65,8 +64,7 @@ MARKER_SIZE_SIGMA = 0.035
 
 STEREO_SIZE_SIGMAS = 4.5
 """The maximum difference of a marker's radius between both views, in standard deviations. If the
-difference is larger, the marker is partly occluded in one view.
-"""
+difference is larger, the marker is partly occluded in one view."""
 
 MAX_MOTION_DIFFERENCE_PX = 2.5
 """The maximum difference between both views in a marker's motion during the exposure."""

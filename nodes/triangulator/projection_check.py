@@ -54,13 +54,11 @@ STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
 
 MAX_DRIFT_M = 3e-4
 """The maximum motion of a mark along the sheet's normal between frame and exposure. If a mark moves
-more, its height above the sheet is not checked.
-"""
+more, its height above the sheet is not checked."""
 
 MAX_GAIN = 4.0
 """The maximum ratio of the standard deviations of the finger's estimated depth and a mark's height.
-If the ratio is larger, the marks are too far from the finger, and the depth is not estimated.
-"""
+If the ratio is larger, the marks are too far from the finger, and the depth is not estimated."""
 
 
 class ProjectionCheck:

@@ -60,8 +60,7 @@ PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
 """The inverse variances of the parameters' starting values. The starting values only affect
-parameters that the pixels do not determine, such as the level of a saturated marker.
-"""
+parameters that the pixels do not determine, such as the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 """The lower bounds (px) on the radius and the blur of a fitted disc."""

@@ -60,8 +60,7 @@ SPACING_RATIO = 1.0 / 3.0
 by the smoothing length `rho`."""
 MIN_NORMAL_COSINE = 0.2
 """The minimum cosine of the angle between the normal of a local quadratic fit (jet) and the normal
-of a vertex that is used for the fit.
-"""
+of a vertex that is used for the fit."""
 MAX_CURVATURE_RATIO = 2.0
 """The maximum curvature (1/m) of a local quadratic fit (jet), multiplied by the smoothing length
 `rho` (m)."""
@@ -603,8 +602,9 @@ def _jet(
     """Fit a quadratic z(x, y) to the points `around` (m, 3) by weighted least squares.
 
     origin, rough (3,): vertex, and approximate normal at this vertex, which defines the z axis.
-        Lengths are scaled by the radius of the fit. If there are too few points, the solution of
-        minimum norm is used. Return the centre (3,), the normal (3,) and the shape operator (3, 3).
+
+    Lengths are scaled by the radius of the fit. If there are too few points, the solution of
+    minimum norm is used. Return the centre (3,), the normal (3,) and the shape operator (3, 3).
     """
     reach = FIT_RATIO * rho
     first = np.cross(rough, _IDENTITY[np.abs(rough).argmin()])
