@@ -199,6 +199,7 @@ class ClosedFormKinematics:
         """Return all solutions (rad) of the inverse kinematics for a flange pose (4, 4).
 
         present_rad: present joint angles (6,), which replace undefined angles at a singularity.
+
         The solutions are in the order of `BRANCHES`, and may exceed the joint ranges. The list is
         empty if the wrist centre is out of reach.
         """
@@ -305,6 +306,7 @@ class ClosedFormKinematics:
         """Return the angle (0 to pi rad) between the upper arm and the line from elbow to wrist.
 
         out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder.
+
         Returns None if the wrist centre is out of reach.
         """
         cosine = (out * out + height * height - self._upper_m**2 - self._elbow_to_wrist_m**2) / (
@@ -378,6 +380,7 @@ class ClosedFormKinematics:
         """Return joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
         near_rad: joint angles (6,) that select among angles that differ by whole revolutions.
+
         Angles may exceed the joint ranges. Angles are NaN for poses out of reach.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)

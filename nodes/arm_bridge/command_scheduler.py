@@ -11,6 +11,7 @@ class CommandScheduler:
 
     period_s: time between periodic commands. target_period_s: time between targets.
     idle_period_s: time between commands to an idle arm.
+
     In all methods, `sent_ns` is the time of the last command, or 0 before the first command.
     """
 
@@ -35,6 +36,7 @@ class CommandScheduler:
         """Return whether a periodic command must be sent now.
 
         target_ns: arrival time of the newest target.
+
         No periodic command is sent shortly before the next target is due, because the arm would
         still be busy when the target arrives.
         """

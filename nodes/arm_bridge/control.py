@@ -242,6 +242,7 @@ class ArmControl:
         """Record that a command was not answered; return False if the previous one was not either.
 
         text: reason that is shown to the operator.
+
         After the first missing answer, the motion continues from the unanswered command.
         """
         if self._missed or self.measured_rad is None:
@@ -325,6 +326,7 @@ class ArmControl:
 
         stamp_ns: timestamp of the message.
         clock_problem: reason why the timestamp is uncertain; empty if the timestamp is certain.
+
         Messages of several nodes may arrive in any order. A reset is therefore refused if its
         timestamp is before the last stop or in the future.
         """
@@ -652,6 +654,7 @@ class ArmControl:
         """Return the sheet's motion after one step towards the target.
 
         speed_factor: factor for the speed bounds; below 1 if this arm is ahead of the other arm.
+
         After a start, the sheet moves slowly until the sheet has reached the target.
         """
         if not self._settled:

@@ -138,6 +138,7 @@ class ArmGeometry:
         """Return the joint angles (6,) rad that move this arm's edge to a pose of the sheet.
 
         present_rad: present joint angles (6,), which must be near the result.
+
         The deflection of the arm by the sheet's tension is compensated. Raises UnreachableError if
         the arm cannot reach the pose.
         """
@@ -159,6 +160,7 @@ class ArmGeometry:
         """Return the encoder angles (6,) rad that place the flange at a world pose (4, 4).
 
         near_rad: joint angles (6,) near the result.
+
         The arm is assumed to be rigid. Raises UnreachableError if the arm cannot reach the pose.
         """
         offsets_rad = self._joint_offsets_rad

@@ -283,6 +283,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 
     edge, other_edge: world poses (4, 4) of this arm's edge and of the other edge.
     left: whether this arm holds the left edge.
+
     Values that are not finite violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
@@ -315,6 +316,7 @@ def check_flange(
     """Return a description of the violated limit (workspace or flange distance), or None.
 
     flange_world, other_flange: world poses (4, 4). slack_m: tolerance on both limits.
+
     Values that are not finite violate both limits.
     """
     position = flange_world[:3, 3]

@@ -112,6 +112,7 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
     """Encode a command block as a list of 16-bit registers.
 
     joints_rad: joint angles (6,).
+
     Sequence number and time are encoded modulo 2^32.
     """
     body = struct.pack(

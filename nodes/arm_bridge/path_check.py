@@ -189,6 +189,7 @@ def _check_alignment(
     """Raise PathError if a straight joint motion of both arms violates a limit.
 
     begin, there: joint angles of both arms at the start and at the end.
+
     Limits that are already violated at the start are widened.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad

@@ -375,6 +375,7 @@ def solve_step(
 
     near: neighbouring step on the path, with joint angles near the solution.
     fraction: position on the path (0 to 1) for the error text.
+
     Raises PathError if a limit of COMMAND_LIMITS is violated.
     """
     step = _solve_both(left, right, sheet, near, fraction=fraction)

@@ -250,6 +250,7 @@ def render_force(
 
     push: stretch ratio, finger radius and position of the push.
     max_depth_m: maximum depth of the finger in the object.
+
     The edge force limits the indentation. The indentation increases by at most
     1 + `limits.max_advance` times the increase of the depth.
     """
@@ -300,6 +301,7 @@ def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Fl
     """Reduce the sheet's advance smoothly to zero at small depths and small contact forces.
 
     depths, indentation: depths and indentations (n,), m. forces_n: contact forces (n,).
+
     Returns the changed indentations (n,), m.
     """
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)

@@ -99,6 +99,7 @@ class ContactStateMachine:
     """A state machine of the finger's contact with the object.
 
     home: axes (3, 3) of the sheet before the first contact; the third axis is the sheet's normal.
+
     Raises UnpresentableError if the tilt of the object's front exceeds the maximum.
     """
 

@@ -107,6 +107,7 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 
     home: axes (3, 3) of the sheet before they are rotated to the normal.
     half_width_m: maximum distance of the contact from the sheet's centre.
+
     The contact is on the sheet's horizontal centre line. Within the maximum distance, the sheet's
     centre is aligned with the object's origin along the sheet's x axis.
     """
@@ -119,6 +120,7 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre for a given velocity of the contact.
 
     rate: velocity (3,) m/s of the contact on the object.
+
     The twist consists of linear velocity (m/s) and angular velocity (rad/s). The angular velocity
     is n x dn/dt with the normal n. The sheet's point in contact is at rest.
     """
@@ -135,6 +137,7 @@ def compute_tangent_twist(
     """Return the twist (6,) of a waiting sheet while its surface point moves.
 
     rate: velocity (3,) m/s of the surface point. home, half_width_m: see `make_tangent_contact`.
+
     With the normal n and the third axis h of `home`, the angular velocity of the sheet is n x dn/dt
     plus -(h x n) . dn/dt / (1 + h . n) about the normal.
     """
@@ -177,6 +180,7 @@ def limit_tilt(
 
     The second result is whether this point differs from `found`.
     front: unit vector (3,) from which the tilt is measured.
+
     The search follows the straight line to `found` in increasing steps, and projects each step onto
     the surface.
     """

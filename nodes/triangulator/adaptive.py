@@ -189,6 +189,7 @@ def solve_riccati(transition: Floats, process_noise: Floats, variance: float) ->
     """Return the steady-state error covariances (models, 5, 5) just before each measurement.
 
     variance: variance of the measurement noise, m^2.
+
     The doubling algorithm (Chu et al. 2004) solves the Riccati equation.
     """
     rows, identity = transition.transpose(0, 2, 1), np.eye(STATES)
@@ -208,6 +209,7 @@ def _solve_gains(interval: int, noise: int) -> Floats:
     """Return the Kalman gains (START_POINTS, models, 5) of one axis for the points of a track.
 
     interval, noise: indices on the grid of frame intervals and noise variances.
+
     The first gains apply to the points 2 to START_POINTS. The last gain is the steady-state gain.
     """
     dt, variance = INTERVAL_RATIO**interval, NOISE_RATIO**noise
@@ -285,6 +287,7 @@ def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
 
     horizons: bytes of a float64 array (n,) of horizons, s. The cache requires hashable arguments.
     ages_ms: age, ms, for which the weights of each scored horizon were computed.
+
     The last factor applies to the correction by the filtered position, and decreases from one at
     the horizon zero to zero at the first age.
     """
@@ -300,6 +303,7 @@ def combine(covariance: Floats) -> Floats:
     """Return the weights (..., models) that minimise the mean square error of the weighted sum.
 
     covariance: covariance (..., models, models) of the models' prediction errors, in any unit.
+
     The sum of the weights is 1. Measurement noise does not change the result, because the noise is
     the same for all models.
     """
@@ -507,6 +511,7 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
     """Rotate the axes of an estimate to axes along which the noise of a new point is uncorrelated.
 
     covariance: noise covariance (3, 3), m^2, of the new point.
+
     Returns the estimate and the noise variances (3,), m^2, along its axes.
     """
     noise = estimate.axes.T @ covariance @ estimate.axes

@@ -382,6 +382,7 @@ class DataAssociation:
         """Assign the markers of an image pair to tracks, and update or create the clutter tracks.
 
         finger: track of the finger; None if the finger is not tracked.
+
         Returns the clutter track of each marker, or None for the finger's marker.
         """
         self.clutter_tracks = [track for track in self.clutter_tracks if track.is_alive(at_ns)]
@@ -439,6 +440,7 @@ def assign_columns(costs: Floats) -> list[int]:
     """Assign a different column to each row so that the sum of the costs is minimal.
 
     costs: cost matrix (n, m) with n <= m.
+
     Returns the column of each row. The algorithm finds shortest augmenting paths (Jonker and
     Volgenant, 1987). Importing the equivalent function of SciPy would take a third of a second.
     """

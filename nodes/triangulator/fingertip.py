@@ -200,6 +200,7 @@ def detect_all(
     volume: minimum and maximum corner (3,) m of the finger's working volume in the world frame.
     gate: region to search; None to search both full images, which must contain only one marker.
     left_origin_px, right_origin_px: column and row of each image's first pixel on the sensor.
+
     If the finger is not found inside the gate, the full images are searched for other markers.
     """
     if gate is not None and not np.isfinite(gate.point).all():

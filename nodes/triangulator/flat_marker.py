@@ -98,6 +98,7 @@ def _centre_offset_px(view: DiscView, normal: Floats, radius_m: float) -> Floats
     """Return the offset (2,), px, from the image of a disc's centre to the centre of its ellipse.
 
     normal: normal (3,) of the disc in the left camera's axes.
+
     The centre of the ellipse is computed from the dual conic of the disc. The lens distortion is
     linearised.
     """

@@ -138,6 +138,7 @@ def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window
 
     shape: size (height, width) of the image. half_px: number of pixels by which the window extends
         on each side.
+
     Returns None if the window is outside the image.
     """
     x, y = pixel.tolist()

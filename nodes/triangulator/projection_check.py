@@ -145,6 +145,7 @@ class ProjectionCheck:
         """Return the velocities (n, 3), m/s, of the marks in a frame; NaN for marks off the sheet.
 
         number: index of the frame in `_frames`.
+
         Returns None if no velocity is known.
         """
         if number == 0:

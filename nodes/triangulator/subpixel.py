@@ -167,6 +167,7 @@ def fit_discs(
     """Fit one disc in each image (height, width).
 
     starts: starting values, one per image. noise: noise of the image sensor.
+
     Pixels outside the image and outside the disc's surroundings are excluded. A saturated (white)
     pixel is used only in iterations in which the model is darker than the pixel.
     """
@@ -191,6 +192,7 @@ def fit_ellipses(
 
     starts: starting values of moving discs. Each ellipse starts with the second moments of its
         disc.
+
     The ellipses are fitted one by one, because the computing time increases with the third power of
     the largest ellipse's size.
     """

@@ -153,6 +153,7 @@ class Tracker:
         """Predict position, velocity and path at the time `at_ns`, not before the newest point.
 
         horizons_s: times (n,) of the path's points after `at_ns`; the first time must be 0.
+
         If the track is lost, the predicted path stays at the last position.
         """
         estimate = self.estimate

@@ -51,6 +51,7 @@ class StereoGeometry:
 
         calibration: source of the lens parameters; None to use the values of the scene. The pose
             always comes from the scene.
+
         Raises CalibrationMismatchError if the calibration belongs to another camera.
         """
         optics: StereoCamera | StereoCalibration = scene_camera
@@ -145,6 +146,7 @@ class ClosestApproach:
 
     rotation_rows: rows of the rotation from the right to the left camera's axes.
     origin: position of the right camera in the left camera's frame, m.
+
     The geometry is stored as Python numbers, which are faster than small arrays.
     """
 
@@ -165,6 +167,7 @@ class ClosestApproach:
         """Return the midpoint (3,), m, and the length (m) of the shortest segment between two rays.
 
         left, right: undistorted normalized coordinates (x, y) of the rays.
+
         Returns None if the rays are parallel, or if the segment is behind a camera.
         """
         (ax, ay), (ox, oy, oz) = left, self.origin
@@ -187,6 +190,7 @@ def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
     """Triangulate points by the direct linear transform (homogeneous linear least squares).
 
     left, right: undistorted normalized coordinates (n, 2). right_from_left: transform (4, 4).
+
     Returns points (n, 3), m, in the left camera's frame.
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
     """
