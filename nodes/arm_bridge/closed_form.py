@@ -72,7 +72,8 @@ BRANCHES = tuple(
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
     """Return the rotation matrix (3, 3) of the forearm.
 
-    joint_1: angle of J1 about z, rad. joints_23: sum of the angles J2 and J3 about y, rad.
+    joint_1: angle of J1 about z, rad.
+    joints_23: sum of the angles J2 and J3 about y, rad.
     """
     c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
     return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
@@ -101,7 +102,8 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
 def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
     """Return the angle of J6 (rad) for which J4, J5 and J6 best approximate a rotation.
 
-    wrist: rotation matrix (3, 3) from the forearm to the flange. q4, q5: angles of J4 and J5, rad.
+    wrist: rotation matrix (3, 3) from the forearm to the flange.
+    q4, q5: angles of J4 and J5, rad.
     """
     s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
     first = (c4 * c5, s4 * c5, -s5)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 class CommandScheduler:
     """A scheduler for the commands to one arm.
 
-    period_s: time between periodic commands. target_period_s: time between targets.
+    period_s: time between periodic commands.
+    target_period_s: time between targets.
     idle_period_s: time between commands to an idle arm.
 
     In all methods, `sent_ns` is the time of the last command, or 0 before the first command.

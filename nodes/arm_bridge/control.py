@@ -133,7 +133,8 @@ class Timeouts:
 class Command:
     """A command for the arm's controller.
 
-    mode: `move`, `hold`, `stop` or `idle`. joints_rad: joint angles (6,) for the mode `move`.
+    mode: `move`, `hold`, `stop` or `idle`.
+    joints_rad: joint angles (6,) for the mode `move`.
     """
 
     mode: str
@@ -258,7 +259,8 @@ class ArmControl:
     def on_exchange_failed(self, text: str, *, silent: bool) -> bool:
         """Record a failed exchange; return True if the connection to the arm has just been lost.
 
-        text: reason that is shown to the operator. silent: whether the arm has not answered.
+        text: reason that is shown to the operator.
+        silent: whether the arm has not answered.
         """
         if silent and self.last_measured_rad is None:
             # The arm has never answered, so it may still be starting, which is no fault.

@@ -190,8 +190,8 @@ class ArmGeometry:
     def measure_sheet(self, joints_rad: Floats, world_from_other_flange: Floats) -> SheetMotion:
         """Return the pose and stretch of a sheet at rest between both arms.
 
-        joints_rad: measured joint angles (6,) of this arm. world_from_other_flange: measured pose
-            (4, 4) of the other arm's flange.
+        joints_rad: measured joint angles (6,) of this arm.
+        world_from_other_flange: measured pose (4, 4) of the other arm's flange.
         """
         other_edge = world_from_other_flange @ self.other_flange_from_edge
         return self.sheet_between(self.world_from_edge(joints_rad), other_edge)
@@ -201,7 +201,8 @@ class ArmGeometry:
     ) -> str | None:
         """Return a description of the limit that the flanges or the sheet violate, or None.
 
-        flange, other_flange: world poses (4, 4). slack_m: tolerance on the limits of the flange.
+        flange, other_flange: world poses (4, 4).
+        slack_m: tolerance on the limits of the flange.
         """
         return check_flange(flange, other_flange, limits, slack_m=slack_m) or check_sheet(
             flange @ self.flange_from_edge,

@@ -118,8 +118,9 @@ def limit_velocity(
 ) -> Floats:
     """Return joint velocities (6,) rad/s for the next step towards a moving goal.
 
-    velocity: result of the previous call. goal_rad: joint angles (6,) of the goal at the end of the
-        step. If they are not finite, the arm decelerates.
+    velocity: result of the previous call.
+    goal_rad: joint angles (6,) of the goal at the end of the step. If they are not finite, the arm
+        decelerates.
 
     For any goal, joints_rad + result * step_s is within the joint ranges, and joint and tool speeds
     are within their limits. If the tool would be too fast, the result is a blend of the desired and
@@ -315,7 +316,8 @@ def check_flange(
 ) -> str | None:
     """Return a description of the violated limit (workspace or flange distance), or None.
 
-    flange_world, other_flange: world poses (4, 4). slack_m: tolerance on both limits.
+    flange_world, other_flange: world poses (4, 4).
+    slack_m: tolerance on both limits.
 
     Values that are not finite violate both limits.
     """

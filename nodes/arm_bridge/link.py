@@ -227,7 +227,8 @@ class ConnectedLink(ABC):
     ) -> tuple[ArmStatus, tuple[int, ...]]:
         """Send one command, wait for its answer, and return the arm's status and counters.
 
-        mode, joints_rad: see `ArmLink`. now_ns: time of the command.
+        mode, joints_rad: see `ArmLink`.
+        now_ns: time of the command.
 
         The first counter is the number of the controller's joint measurements. Raises
         ArmSilentError, ArmRefusedError or ArmAnswerError.

@@ -79,7 +79,8 @@ _PACKET = struct.Struct("<" + "".join(f"{field.count}{field.kind}" for field in 
 class MxtStatus(ArmStatus):
     """The contents of an answer packet.
 
-    count: number of the controller's communications. timeouts: number of cycles without a command.
+    count: number of the controller's communications.
+    timeouts: number of cycles without a command.
     """
 
     count: int

@@ -57,8 +57,8 @@ class OtherArm:
     ) -> OtherArm:
         """Convert a state message of the other arm's bridge.
 
-        age_s: age of the message. target_source_ns: time of the camera exposure for this arm's
-            target.
+        age_s: age of the message.
+        target_source_ns: time of the camera exposure for this arm's target.
         """
         other_ns = state.target_source_ns
         ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)

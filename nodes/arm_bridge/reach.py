@@ -183,8 +183,8 @@ def _margins(
 ) -> dict[str, Floats]:
     """Return the margins (n,) of all limits for n poses of the sheet.
 
-    joints: joint angles (n, 6) rad. flanges, others: world poses (n, 4, 4) of this arm's flange and
-        of the other arm's flange.
+    joints: joint angles (n, 6) rad.
+    flanges, others: world poses (n, 4, 4) of this arm's flange and of the other arm's flange.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     without = np.full(len(joints), np.inf)
@@ -255,7 +255,8 @@ class PathStep:
 class PathError(FlexsheetError, ValueError):
     """An error for a path that the arms cannot follow.
 
-    limit: a member of `LIMITS`, "jump" or "alignment". fraction: position on the path, 0 to 1.
+    limit: a member of `LIMITS`, "jump" or "alignment".
+    fraction: position on the path, 0 to 1.
     """
 
     code = "path"

@@ -104,8 +104,8 @@ Row = dict[tuple[State, Event], State | None]
 def _row(event: Event, to: Mapping[State, State], *ignored_in: Iterable[State]) -> Row:
     """Return the transitions of one event; raise ValueError if a state occurs twice.
 
-    to: mapping from each state to the next state. ignored_in: groups of states that ignore the
-        event.
+    to: mapping from each state to the next state.
+    ignored_in: groups of states that ignore the event.
     """
     ignored = [state for group in ignored_in for state in group]
     row: Row = {(state, event): None for state in ignored} | {

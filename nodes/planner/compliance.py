@@ -300,7 +300,8 @@ def _indentation_for_edge_force(
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
     """Reduce the sheet's advance smoothly to zero at small depths and small contact forces.
 
-    depths, indentation: depths and indentations (n,), m. forces_n: contact forces (n,).
+    depths, indentation: depths and indentations (n,), m.
+    forces_n: contact forces (n,).
 
     Returns the changed indentations (n,), m.
     """
@@ -420,7 +421,8 @@ class Compliance:
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
     """Return the weights (n,) for an interpolation that is linear in the squared coordinate.
 
-    nodes: coordinates (n,) of the known values. at: coordinate of the interpolated value.
+    nodes: coordinates (n,) of the known values.
+    at: coordinate of the interpolated value.
     """
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))

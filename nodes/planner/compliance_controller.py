@@ -158,9 +158,10 @@ class ComplianceController:
         """Return the sheet's normal offset (m), and its derivative with respect to the depth.
 
         depth_m: depth of the finger in the object.
-        position_m: (x, y) of the contact on the sheet. A positive offset is behind the object's
-            tangent plane. If the hysteresis is not zero, the result also depends on the depths of
-            earlier calls.
+        position_m: (x, y) of the contact on the sheet.
+
+        A positive offset is behind the object's tangent plane. If the hysteresis is corrected, the
+        result also depends on the depths of earlier calls.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:

@@ -200,9 +200,10 @@ class ContactStateMachine:
     ) -> tuple[Nearest, Floats]:
         """Return the surface point to which the contact moves, and its velocity (3,) m/s.
 
-        found: surface point nearest to the finger. moved: displacement (3,) m of the finger since
-            the last step. velocity: velocity (3,) m/s of the finger. depth: depth (m) of the
-            finger.
+        found: surface point nearest to the finger.
+        moved: displacement (3,) m of the finger since the last step.
+        velocity: velocity (3,) m/s of the finger.
+        depth: depth (m) of the finger.
 
         At small depths, the contact is the surface point nearest to the finger. Deep inside the
         object, the contact moves as far as the finger moves along the sheet. Both motions are

@@ -58,7 +58,8 @@ class OscillationWatchdog:
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
         """Add a measurement, and return the weight (0 to 1) of the offset's motion.
 
-        depth_m: measured depth. offset_m: offset of the sheet at the time of the measurement.
+        depth_m: measured depth.
+        offset_m: offset of the sheet at the time of the measurement.
         step_s: time since the last measurement.
         """
         if self._slow is None:

@@ -136,7 +136,8 @@ def compute_tangent_twist(
 ) -> Floats:
     """Return the twist (6,) of a waiting sheet while its surface point moves.
 
-    rate: velocity (3,) m/s of the surface point. home, half_width_m: see `make_tangent_contact`.
+    rate: velocity (3,) m/s of the surface point.
+    home, half_width_m: see `make_tangent_contact`.
 
     With the normal n and the third axis h of `home`, the angular velocity of the sheet is n x dn/dt
     plus -(h x n) . dn/dt / (1 + h . n) about the normal.

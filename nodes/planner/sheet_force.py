@@ -78,7 +78,8 @@ def compute_membrane_table(
 ) -> TabulatedSheetModel:
     """Compute a table of the sheet's force by finite elements of the membrane.
 
-    stretches: stretch ratios (n,). xs_m, ys_m: coordinates of the pushes on the sheet.
+    stretches: stretch ratios (n,).
+    xs_m, ys_m: coordinates of the pushes on the sheet.
     progress: function that receives the number of finished pushes and the total number of pushes.
     """
 

@@ -463,7 +463,8 @@ class AdaptiveBank:
 def _forget(dt: float, memory_s: float, memory_points: int) -> float:
     """Return the weight of a new value in an exponential average.
 
-    dt: time since the last value, s.  memory_s: time constant of the average.
+    dt: time since the last value, s.
+    memory_s: time constant of the average.
     memory_points: minimum number of points in the average.
     """
     return min(-math.expm1(-dt / memory_s), 1.0 / memory_points)

@@ -136,8 +136,8 @@ Refine = Callable[[Sequence[Image], Sequence[Blob], PixelNoise], list[Marker]]
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
     """Return the square window around a pixel (x, y), clipped to the image.
 
-    shape: size (height, width) of the image. half_px: number of pixels by which the window extends
-        on each side.
+    shape: size (height, width) of the image.
+    half_px: number of pixels by which the window extends on each side.
 
     Returns None if the window is outside the image.
     """

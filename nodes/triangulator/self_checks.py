@@ -117,7 +117,8 @@ class CameraCheck:
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
         """Add a position of the finger pad, and check it if the finger rests at the known point.
 
-        point: world position (3,), m. reprojection_px: reprojection error of the finger's marker.
+        point: world position (3,), m.
+        reprojection_px: reprojection error of the finger's marker.
         """
         self._reprojection.add(np.array([reprojection_px]), at_ns)
         if self._touch_point is None:

@@ -166,7 +166,8 @@ def fit_discs(
 ) -> list[DiscFit]:
     """Fit one disc in each image (height, width).
 
-    starts: starting values, one per image. noise: noise of the image sensor.
+    starts: starting values, one per image.
+    noise: noise of the image sensor.
 
     Pixels outside the image and outside the disc's surroundings are excluded. A saturated (white)
     pixel is used only in iterations in which the model is darker than the pixel.
@@ -387,8 +388,8 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Return the grey levels (n, s s) of n discs in s x s pixels, and derivatives (n, parameters, s
     s).
 
-    found: parameters (n, parameters) of the discs. x, y: coordinates of the pixels, (1, 1, s) and
-        (1, s, 1).
+    found: parameters (n, parameters) of the discs.
+    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
 
     A moving (motion-blurred) disc is averaged over k positions, in arrays (n, k, s, s).
     """
@@ -438,8 +439,8 @@ def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats
 
     The derivatives have the shape (n, parameters, s s).
 
-    found: parameters (n, parameters) of the ellipses. x, y: coordinates of the pixels, (1, 1, s)
-        and (1, s, 1).
+    found: parameters (n, parameters) of the ellipses.
+    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
     """
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
@@ -488,7 +489,8 @@ def _make_fit(
 ) -> DiscFit:
     """Make the result of one fit, with a larger covariance if the residuals exceed the noise.
 
-    found: fitted parameters. corner: column and row of the cut-out's first pixel.
+    found: fitted parameters.
+    corner: column and row of the cut-out's first pixel.
     fitness: one element of the result of `_fit_residuals`.
     """
     squares, pixels, weight, ratio = fitness

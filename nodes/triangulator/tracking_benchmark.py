@@ -59,8 +59,9 @@ class TruePathCase:
 class MeasuredPath:
     """The simulated measurements of a path at n times.
 
-    times_ns: times (n,). points: measured points (n, 3), m. covariances: covariances (n, 3, 3),
-        m^2.
+    times_ns: times (n,).
+    points: measured points (n, 3), m.
+    covariances: covariances (n, 3, 3), m^2.
 
     truth: true points (n, 3), m, at the predicted times, for each prediction horizon.
     """
@@ -76,7 +77,8 @@ def measure_path(
 ) -> MeasuredPath:
     """Simulate the measurement of a finger's path by the scene's stereo camera.
 
-    seed: seed of the random noise. noise_px: standard deviation of a marker's centre.
+    seed: seed of the random noise.
+    noise_px: standard deviation of a marker's centre.
     """
     geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
     times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)

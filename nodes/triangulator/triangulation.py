@@ -189,7 +189,8 @@ class ClosestApproach:
 def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
     """Triangulate points by the direct linear transform (homogeneous linear least squares).
 
-    left, right: undistorted normalized coordinates (n, 2). right_from_left: transform (4, 4).
+    left, right: undistorted normalized coordinates (n, 2).
+    right_from_left: transform (4, 4).
 
     Returns points (n, 3), m, in the left camera's frame.
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 12.2.

@@ -388,7 +388,9 @@ def intersect_rays(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Intersect lines through a point with triangles.
 
-    origin (3,): common point of the lines. rays (n, 3): directions. corners (m, 3, 3): triangles.
+    origin (3,): common point of the lines.
+    rays (n, 3): directions.
+    corners (m, 3, 3): triangles.
 
     Return the index (n,) of the triangle that each line intersects, and the barycentric weights (n,
     3) of its corners. The weights are NaN if the line misses all triangles. Source: Möller and
