@@ -78,8 +78,8 @@ class CameraTruth(Part):
     )
     skew_s: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
         default=0.0,
-        description="exposure time of the right image minus that of the left image; the camera "
-        "does not report it",
+        description="exposure time of the right image minus exposure time of the left image, which "
+        "the camera does not report",
     )
     exposure_jitter_s: Annotated[float, Field(ge=0, le=0.05)] = Field(
         default=0.0,
@@ -226,7 +226,7 @@ class GaugeTruth(Part):
         default=0.0, description="standard deviation of a reading"
     )
     offset_n: Annotated[float, Field(ge=-10, le=10)] = Field(
-        default=0.0, description="reading without a force"
+        default=0.0, description="reading while no force acts"
     )
     gain_ratio: NearOne = 1.0
     lag_s: Annotated[float, Field(ge=0, le=1)] = Field(
@@ -292,7 +292,7 @@ class Apparatus(Message):
     origin: str = Field(default="file", description="origin of the values, as text for users")
     nominal: Devices | None = Field(
         default=None,
-        description="devices to which the deviations refer; null: those of the scene",
+        description="devices to which the deviations refer; null: the devices of the scene",
     )
     camera: CameraTruth = Field(default_factory=CameraTruth)
     arms: ArmsTruth = Field(default_factory=ArmsTruth)

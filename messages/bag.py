@@ -91,14 +91,15 @@ def split_frames(data: bytes) -> list[memoryview]:
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0
     offset = 8 + 8 * count
     if not count or offset > len(view):
-        raise WireError("malformed", "the recorded bytes are not a message's frames")
+        raise WireError("malformed", "the recorded message does not begin with its frame lengths")
     frames = []
     for length in struct.unpack_from(f"<{count}Q", view, 8):
         frames.append(view[offset : offset + length])
         offset += length + -length % 8
     if offset != len(view):
         raise WireError(
-            "malformed", f"the recorded frames have {len(view)} bytes, expected {offset}"
+            "malformed",
+            f"the recorded message has {len(view)} bytes, but its frame lengths require {offset}",
         )
     return frames
 

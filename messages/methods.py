@@ -47,7 +47,7 @@ class Methods(BaseModel):
     soft_body: SoftBodyChoice | None = None
     compliance: ComplianceMode | None = Field(
         default=None,
-        description="how the sheet renders the object's force; constant_stretch: it does not",
+        description="how the sheet renders the object's force; constant_stretch: not at all",
     )
 
 

@@ -324,7 +324,7 @@ def _resolve(schema: Any, parts: Schema) -> Any:
         if not (isinstance(schema, Mapping) and "$ref" in schema):
             return schema
         schema = parts[str(schema["$ref"]).rpartition("/")[2]]
-    raise TypeError("cyclic reference")
+    raise TypeError("the JSON Schema contains a cycle of references")
 
 
 def _options(schema: Schema) -> list[Any]:

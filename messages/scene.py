@@ -125,7 +125,9 @@ class Mesh(Part):
 
     shape: Literal["mesh"] = "mesh"
     vertices_m: Vertices
-    triangles: Triangles = Field(description="vertex indices, counter-clockwise from outside")
+    triangles: Triangles = Field(
+        description="vertex indices, counter-clockwise when seen from outside"
+    )
     smoothing_m: Positive = Field(description="length below which details and edges are smoothed")
     origin: str = Field(description="source file and repairs, for information")
 

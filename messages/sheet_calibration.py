@@ -61,7 +61,7 @@ class SheetCalibration(Part):
     """
 
     version: Literal[1] = 1
-    date: str = Field(description="ISO 8601, UTC")
+    date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
     source: str = Field(description="file of the measurements, or scene of the simulator")
     nominal_width_m: Positive = Field(
@@ -73,7 +73,8 @@ class SheetCalibration(Part):
     modulus_thickness_n_per_m: Fitted
     slack_width_m: Fitted
     cubic_ratio: Fitted = Field(
-        description="cubic term of the unstretched sheet's force, divided by that of ideal rubber"
+        description="cubic term of the unstretched sheet's force, divided by the cubic term of "
+        "ideal rubber"
     )
     mooney_ratio: Fitted | None = Field(
         default=None, description="Mooney-Rivlin constants C2/(C1+C2); null: not fitted"

@@ -247,7 +247,8 @@ class ArmState(Message):
     )
     trajectory_ends_ns: Stamp = Field(
         default=0,
-        description="end of the target's trajectory that the arm may follow; 0: not at all",
+        description="end of the target's trajectory that the arm may follow; 0: the arm follows no "
+        "trajectory",
     )
     command_sent_ns: Stamp = Field(description="time of the newest command to the arm; 0: none")
     edge_distance_m: NonNegative | None = Field(
@@ -316,7 +317,7 @@ class SoftBody(Message):
     )
     in_transition: bool = Field(
         default=False,
-        description="true: `method` gradually replaces another one, which still contributes",
+        description="true: `method` gradually replaces another method, which still contributes",
     )
     displacement_world_m: Points3
 
@@ -539,7 +540,7 @@ class ClockOffset(MessagePart):
     offset_ns: int
     uncertainty_s: NonNegative = Field(description="maximum error of the offset")
     drift_ratio: Finite = Field(
-        description="rate of the other clock divided by that of the header's clock, minus one"
+        description="rate of the other clock divided by the rate of the header's clock, minus one"
     )
     resets: int = Field(ge=0, description="number of detected jumps of the clock")
 

@@ -57,7 +57,8 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
         )
     if len(triangles) > MAX_TRIANGLES:
         raise MeshError(
-            f"the mesh has {len(triangles)} triangles, the maximum is {MAX_TRIANGLES}; simplify it"
+            f"the mesh has {len(triangles)} triangles, but the maximum is {MAX_TRIANGLES}; "
+            "simplify the mesh"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise MeshError(
