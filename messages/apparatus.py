@@ -271,7 +271,7 @@ class ProjectorTruth(Part):
 
 
 class Devices(Part):
-    """The parameters of all devices in a scene, without the virtual object."""
+    """The parameters of all devices in a scene. The virtual object is not included."""
 
     camera: StereoCamera
     arms: Arms

@@ -5,7 +5,7 @@ The MCAP format leaves these details to the application:
 - The profile is "flexsheet". Each message type has a schema (JSON Schema). Each topic has a channel
   with the encoding "flexsheet/2". The channel's metadata contain the fingerprint of the type.
 - `log_time` is when the recorder received the message, and `publish_time` is the source timestamp
-  in the message's header. Both are in ns of a monotonic clock, not since 1970.
+  in the message's header. Both are times of a monotonic clock, in ns, and do not count from 1970.
 - The data of a message are its frames (byte strings of a ZeroMQ multipart message). The data begin
   with the number of frames (uint32), four zero bytes, and the length of each frame (uint64). Then
   the frames follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays

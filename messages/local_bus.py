@@ -146,7 +146,8 @@ class LocalChannel:
 class LocalBus:
     """The set of all message channels inside one process.
 
-    endpoints: endpoints to which the publishers of this process bind. Each has one channel.
+    endpoints: endpoints to which the publishers of this process bind. Each endpoint has one
+        channel.
     """
 
     def __init__(self, endpoints: Iterable[str]) -> None:

@@ -370,11 +370,11 @@ class Node:
         """Connect the ports to topics.
 
         send: function that sends messages.
-        topics: topic names by port, for ports whose name differs from that of the topic, such as
+        topics: topic names by port, for ports whose name differs from the topic's name, such as
             {"arm": "arm_left"}.
         epoch: number that identifies one start of the node; None for the time (ns) of the start.
 
-        Raises TypeError if the message type of a topic differs from that of its port.
+        Raises TypeError if the message types of a port and of its topic differ.
         """
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash

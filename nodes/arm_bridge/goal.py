@@ -45,7 +45,7 @@ MAX_PREDICTION_S = 0.15
 margin."""
 
 MAX_TRAJECTORY_S = 0.4
-"""The maximum duration of a trajectory, during which an arm moves without a new message."""
+"""The maximum duration of a trajectory, on which an arm moves even if no new message arrives."""
 
 SKEW_LENGTH_M = 0.25
 """The offset between two sheet poses that counts as much as a rotation of 1 rad."""

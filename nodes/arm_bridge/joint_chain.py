@@ -71,7 +71,7 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class SeedBranch(NamedTuple):
-    """A branch of an arm without closed-form kinematics, defined by one joint solution (6,) rad."""
+    """A branch of an arm whose kinematics have no closed form, defined by one joint solution."""
 
     seed_rad: tuple[float, ...]
 

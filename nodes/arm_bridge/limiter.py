@@ -30,8 +30,8 @@ MAX_TRAVEL_STEP_S = 0.01
 commands, the arm would exceed the tool speed to catch up."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
-"""The minimum and the maximum duration of a command. With a shorter duration, rounding errors would
-dominate the computed speeds."""
+"""The minimum and the maximum duration of a command. If the duration were shorter, rounding errors
+would dominate the computed speeds."""
 
 LENGTH_TOLERANCE_M = 1e-7
 MIN_BLEND = 0.02

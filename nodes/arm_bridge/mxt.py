@@ -80,7 +80,7 @@ class MxtStatus(ArmStatus):
     """The contents of an answer packet.
 
     count: number of the controller's communications.
-    timeouts: number of cycles without a command.
+    timeouts: number of cycles in which no command arrived.
     """
 
     count: int

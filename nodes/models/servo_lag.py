@@ -112,7 +112,7 @@ class ServoLagEstimator:
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
-        """Create an estimator without data.
+        """Create an estimator that has no data yet.
 
         initial_s: initial lag, s; limited to the bounds.
         """

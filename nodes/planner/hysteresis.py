@@ -13,8 +13,8 @@ REVERSAL_RATIO = 0.2
 of the depth."""
 
 MIN_REVERSAL_M = 4e-4
-"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. With a
-smaller value, tremor would reverse the hysteresis at small depths."""
+"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. If the
+value were smaller, tremor would reverse the hysteresis at small depths."""
 
 
 class HysteresisCorrection:

@@ -426,5 +426,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""The refinement of flat markers for each method. Methods without an entry detect round markers
+"""The refinement of flat markers for each method. A method that has no entry detects round markers
 only."""

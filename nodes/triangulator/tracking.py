@@ -43,7 +43,7 @@ class TrackingSettings:
 
     max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger's motion. Points outside these
         limits are rejected.
-    track_timeout_s: maximum time without a point before the track is lost.
+    track_timeout_s: maximum time since the last point before the track is lost.
     confirm_frames: number of consecutive consistent points that start or replace a track.
     """
 
