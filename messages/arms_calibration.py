@@ -81,7 +81,7 @@ class ArmsCalibration(Part):
 def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
     """Write the calibration of the arm bases to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

@@ -356,7 +356,7 @@ class AttachmentInfo:
 class BagInfo:
     """A summary of a bag. All times are on the recorder's clock.
 
-    problem: reason why the bag is incomplete; empty for a complete bag.
+    problem: reason why the bag is incomplete; empty if the bag is complete.
     """
 
     path: Path
@@ -377,7 +377,7 @@ class BagReader:
     Iteration yields (topic name, message, header, log time in ns), in the order of log time. The
     log time is the time when the recorder received the message.
 
-    topics: names of the topics to read; None: all topics.
+    topics: names of the topics to read; None means all topics.
     start_ns, end_ns: range of log time to read. A message at `end_ns` is not included.
 
     Raises BagError if the file cannot be read or is not a bag, or if a topic name is unknown.
@@ -734,7 +734,7 @@ class RecoverReport:
 
     messages, attachments: numbers of recovered messages and attachments.
     was_complete: whether the original bag was complete.
-    problem: reason why the original bag was incomplete; empty for a complete bag.
+    problem: reason why the original bag was incomplete; empty if it was complete.
     orphan_messages: number of messages that were not recovered because the bag does not describe
         their channel.
     """

@@ -156,7 +156,7 @@ def compute_queue_length(topic: Topic) -> int:
 class Source:
     """An endpoint to which a subscriber connects.
 
-    writer: name of the node that publishes at the endpoint; None: any node.
+    writer: name of the node that publishes at the endpoint; None means any node.
     host: name of the host at the endpoint. If keys are used, the endpoint must have the key of this
         host.
     """
@@ -173,7 +173,8 @@ class Publisher:
     given.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port". "tcp://127.0.0.1:*" selects a free port.
-    keys: keys of the hosts that may connect over tcp; None: tcp is bound to the loopback interface.
+    keys: keys of the hosts that may connect over tcp. If None, tcp is bound to the loopback
+        interface.
     on_refused: function that is called with a text for each refused or closed connection. If no
         event loop is running, a separate thread calls the function.
     local: bus that passes messages to subscribers in this process without encoding. The socket is
@@ -367,13 +368,13 @@ class Subscriber:
     on_problem: function that is called with a text about a problem: the first rejection for each
         cause, and each exception in `on_message`. Lost messages are a problem each time their
         number has doubled, except on topics with the delivery `latest`.
-    on_handshake_failed: function that is called with a text for each kind of failed handshake;
-        None: `on_problem` is called.
+    on_handshake_failed: function that is called with a text for each kind of failed handshake. If
+        None, `on_problem` is called.
     raw: whether `on_message(frames, header)` is called with the undecoded frames of every message.
         The fields are then not validated.
-    keys: keys of this host and of the other hosts; None: tcp connects to the loopback interface
+    keys: keys of this host and of the other hosts. If None, tcp connects to the loopback interface
         only.
-    plan: hash of the resolved launch file whose messages are accepted; None: all messages are
+    plan: hash of the resolved launch file whose messages are accepted. If None, all messages are
         accepted.
     message_filter: function that is called with each valid message before `on_message`.
     on_disconnected: function that is called when a connection has ended, after its last message.
@@ -483,7 +484,7 @@ class Subscriber:
 
         Return False if the message is rejected, or if it has arrived before.
 
-        writers: names of the nodes that may publish at the endpoint; None: any node.
+        writers: names of the nodes that may publish at the endpoint; None means any node.
         """
         try:
             if writers is not None and header.writer not in writers:

@@ -127,7 +127,7 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
 def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
     """Write a stereo calibration to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

@@ -48,7 +48,8 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
     An existing file is replaced only after the new file has been written completely.
 
     title: first comment line of the file.
-    comment: second comment line, such as the command that wrote the file; empty for none.
+    comment: second comment line, such as the command that wrote the file; empty if there is no
+        second comment line.
 
     Raises FileWriteError if the file cannot be written.
     """

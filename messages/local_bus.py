@@ -161,7 +161,7 @@ class LocalBus:
 class LocalConnection:
     """A connection of a subscriber to publishers in its own process.
 
-    writers: names of the nodes whose messages are accepted; None: any node.
+    writers: names of the nodes whose messages are accepted; None means any node.
     max_waiting: maximum number of messages in the queue. A full queue drops the newest message, and
         the subscriber counts it as lost.
     """

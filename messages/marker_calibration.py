@@ -64,7 +64,7 @@ def save_marker_calibration(
 ) -> None:
     """Write a marker calibration to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

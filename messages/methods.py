@@ -55,7 +55,7 @@ def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: 
     """Return the method that a node uses.
 
     parameter: value of the node's parameter; "auto" selects the scene's choice.
-    by_scene: choice of the scene; None selects `default`.
+    by_scene: choice of the scene; None means `default`.
     """
     if parameter != "auto":
         return parameter

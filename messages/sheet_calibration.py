@@ -118,7 +118,7 @@ def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
 def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
     """Write a sheet calibration to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

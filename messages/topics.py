@@ -34,7 +34,7 @@ class Delivery(StrEnum):
 class Topic:
     """A topic: a named stream of messages of one type.
 
-    rate_hz: expected minimum and maximum rate, for health checks; None: no expected rate.
+    rate_hz: expected minimum and maximum rate, for health checks; None if no rate is expected.
     logged: whether the topic is recorded by default.
     many_writers: whether any number of nodes may publish the topic; if false, only one node may.
     max_bytes: maximum size of a message, checked when it is sent and when it is received.

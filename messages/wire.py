@@ -111,7 +111,7 @@ def encode(
 ) -> list[Buffer]:
     """Encode a message as frames (byte strings of a ZeroMQ multipart message).
 
-    max_bytes: maximum size of the message; None: no limit.
+    max_bytes: maximum size of the message; None means no limit.
     inline_bytes: maximum size of an array inside the header frame. Each larger array is a frame.
 
     Raises WireError if a field cannot be encoded, or if the message is too large.
@@ -186,8 +186,8 @@ def read_envelope(
 
     frames: buffers (bytes, memoryview or zmq.Frame). The first buffer is the header.
     expected: topic or message type. A topic also limits the size of the message.
-    fingerprint, type_name: fingerprint and name of a recorded message type; None: values of the
-        current type.
+    fingerprint, type_name: fingerprint and name of a recorded message type; None means the values
+        of the current type.
 
     Raises WireError if the message is invalid or unexpected.
     """

@@ -103,7 +103,7 @@ class Family:
         must be run before the next trial is requested.
     tolerance: function that returns the scene's tolerance for the error, in `unit`.
     sweep_key: key of a property of the cases. A separate plot shows the errors against this
-        property. None: there is no such plot.
+        property. If None, there is no such plot.
     prepare: function that computes and caches the data for `trials`, and reports its progress.
     """
 

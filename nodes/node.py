@@ -186,8 +186,8 @@ class Output(Generic[M]):
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
         """Publish a message, and return its header.
 
-        source_ns: time of the measurement from which the message was computed; None for the current
-            time.
+        source_ns: time of the measurement from which the message was computed; None means the
+            current time.
         """
         now_ns = self._clock.now_ns()
         header = Header(
@@ -372,7 +372,7 @@ class Node:
         send: function that sends messages.
         topics: topic names by port, for ports whose name differs from the topic's name, such as
             {"arm": "arm_left"}.
-        epoch: number that identifies one start of the node; None for the time (ns) of the start.
+        epoch: number that identifies one start of the node; None means the time (ns) of the start.
 
         Raises TypeError if the message types of a port and of its topic differ.
         """

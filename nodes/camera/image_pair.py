@@ -61,7 +61,7 @@ class ImagePair:
         the start of the file.
     exposure_s: duration of the exposure that the device reports; None if unknown.
     skew_s: mid-exposure time of the right image minus mid-exposure time of the left image.
-    regions: sensor regions of the images; None for full sensors.
+    regions: sensor regions of the images; None means full sensors.
     notes: remarks for the operator.
     """
 
@@ -79,9 +79,10 @@ class Reader(Protocol):
 
     paced: whether `read` returns immediately, as for files. In that case, the caller must wait
         until each image pair is due.
-    rate_hz: frame rate of a device, to count lost frames; None for files.
+    rate_hz: frame rate of a device, to count lost frames; None if the source is a file.
     warnings: texts about settings that the device did not accept.
-    opened: texts about the actual format and settings of each device; empty for files.
+    opened: texts about the actual format and settings of each device; empty if the source is a
+        file.
     """
 
     paced: bool

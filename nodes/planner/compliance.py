@@ -444,7 +444,7 @@ def fit_compliance(
     """Find the stretch ratio and the sheet offset that best render a force curve.
 
     stretch_ratio: fixed stretch ratio; None to choose the best stretch ratio.
-    max_depth_m: maximum depth of a push; None for the value of the scene.
+    max_depth_m: maximum depth of a push; None means the value of the scene.
     """
     depth_m = scene.working_range.push_depth_m if max_depth_m is None else max_depth_m
     radius_m, rubber = scene.finger.radius_m, model.rubber

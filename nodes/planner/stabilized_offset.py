@@ -39,7 +39,7 @@ class StabilizedOffset:
 
         offset_at_depth: function from the depth (m) to the offset (m).
         step_s: time since the last measurement.
-        bandwidth_rad_per_s: bandwidth of the depth filter; infinite for no filter.
+        bandwidth_rad_per_s: bandwidth of the depth filter; infinite if there is no filter.
         delay_s: time from a measurement until the sheet has moved.
         """
         if measured_depth_m <= 0.0:

@@ -249,7 +249,7 @@ def _match_in(
 ) -> StereoDetection:
     """Detect markers in one window of each image.
 
-    windows: windows of the left and right image; None for the full image.
+    windows: windows of the left and right image; None means the full image.
     """
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
@@ -327,7 +327,7 @@ def _match_blobs(
 class RefinedPair:
     """A pair of blobs with refined markers.
 
-    rejection_reason: reason why the pair cannot be the marker; None for a valid marker.
+    rejection_reason: reason why the pair cannot be the marker; None if the marker is valid.
     cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
         standard deviations.
     """
@@ -485,7 +485,7 @@ def _refine_markers(
 def _rejection_reason(
     inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]
 ) -> FingertipReason | None:
-    """Return the reason why a refined pair cannot be the marker, or None for a valid marker."""
+    """Return the reason why a refined pair cannot be the marker, or None if the marker is valid."""
     for marker in markers:
         if marker.rejection_reason is not None:
             return marker.rejection_reason

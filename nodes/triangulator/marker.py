@@ -115,7 +115,7 @@ class Marker:
     elongation: vector (e, f), px, for a flat marker that is seen at an angle; see the module
         `ellipse`.
     height: difference of grey levels between the marker and its surroundings.
-    rejection_reason: reason why the blob is not a marker; None for a valid marker.
+    rejection_reason: reason why the blob is not a marker; None if the marker is valid.
     """
 
     centre: Floats
