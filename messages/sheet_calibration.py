@@ -57,7 +57,8 @@ class SheetTable(Part):
 class SheetCalibration(Part):
     """The calibration of a rubber sheet.
 
-    The file contains the fitted parameters of the force model, and the range of the measurements.
+    The calibration contains the fitted parameters of the force model, and the range of the
+    measurements.
     """
 
     version: Literal[1] = 1

@@ -293,7 +293,7 @@ ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
 
 
 class SoftBody(Message):
-    """The deformation of the soft body under the finger, and its force on the finger."""
+    """The deformation of the soft body under the finger, and the body's force on the finger."""
 
     mesh_id: str
     method: str

@@ -137,7 +137,7 @@ class Input(Generic[M]):
 
     All timestamps are converted to this host's clock.
 
-    clock_problem: reason why the conversion is not reliable, or "".
+    clock_problem: reason why the conversion is not reliable, or "" if it is.
     has_ended: whether the connection to the writer has ended since the last message; updated only
         for the `watched_inputs` of a node.
     """
@@ -482,7 +482,7 @@ class Node:
         """Store a message in its input, call its handler, and wait until it is finished.
 
         header: header with timestamps of this host's clock.
-        clock_problem: reason why the timestamps are not reliable, or "".
+        clock_problem: reason why the timestamps are not reliable, or "" if they are.
         """
         self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)

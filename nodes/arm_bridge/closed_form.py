@@ -319,7 +319,7 @@ class ClosedFormKinematics:
         return acos(min(1.0, max(-1.0, cosine)))
 
     def _solve_shoulder(self, out: float, height: float, q3: float) -> float:
-        """Return the angle of J2 (rad) that moves the wrist centre to a position.
+        """Return the angle of J2 (rad) that moves the wrist centre to the given position.
 
         out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder.
         q3: angle of J3, rad.
@@ -381,7 +381,8 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        near_rad: joint angles (6,) that select among angles that differ by whole revolutions.
+        near_rad: joint angles (6,). Of angles that differ by whole revolutions, the nearest to
+            these is returned.
 
         Angles may exceed the joint ranges. Angles are NaN for poses out of reach.
         """

@@ -324,7 +324,7 @@ class ArmControl:
     def on_estop(
         self, estop: EStop, stamp_ns: int, now_ns: int, clock_problem: str = ""
     ) -> str | None:
-        """Engage or reset the e-stop; return the reason if a reset is refused, otherwise None.
+        """Engage or reset the e-stop; return the reason if a reset is refused, or None if not.
 
         stamp_ns: timestamp of the message.
         clock_problem: reason why the timestamp is uncertain; empty if the timestamp is certain.
@@ -359,7 +359,7 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm; return the reason if the command is refused, otherwise None.
+        """Arm or disarm the arm; return the reason if the command is refused, or None if not.
 
         age_s: age of the operator's command.
         """
@@ -418,7 +418,7 @@ class ArmControl:
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return the reason why motion is forbidden, or None.
+        """Return the reason why motion is forbidden, or None if motion is permitted.
 
         other: state of the other arm; None if the other arm's messages are late.
         """
@@ -491,7 +491,7 @@ class ArmControl:
         return self._move_to_target(goal, other, measured)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
-        """Return the reason if the arm must stop without slackening the sheet, otherwise None."""
+        """Return the reason if the arm must stop without slackening the sheet, or None if not."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if other is not None and other.estopped:
@@ -837,7 +837,9 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured))
 
     def _restart_refusal(self, measured: Floats) -> str | None:
-        """Return the reason why a motion must not start from the measured angles (6,) rad, or None.
+        """Return the reason why no motion may start at the measured angles (6,) rad, or None.
+
+        None means that a motion may start.
 
         Away from the last commanded position, a motion may start only if the measurements are
         plausible. If the measured angles were wrong, the arm would jump.

@@ -29,7 +29,7 @@ RANGE_MARGIN_RAD = np.radians(2.0)
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
 """The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
-Servos ripple and measurements are noisy."""
+The margins are necessary because servos ripple and measurements are noisy."""
 
 EDGE_SPEED_FRACTION = 0.95
 """The fraction of the maximum tool speed that the sheet's edges may use."""
@@ -116,7 +116,7 @@ class ArmGeometry:
         return pose
 
     def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
-        """Return an upper bound (m) of the edge's motion between two joint vectors (6,) rad."""
+        """Return an upper bound (m) of the edge's motion between two sets of joint angles (6,) rad."""
         return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
@@ -199,7 +199,7 @@ class ArmGeometry:
     def check_limits(
         self, flange: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
     ) -> str | None:
-        """Return a description of the limit that the flanges or the sheet violate, or None.
+        """Describe the limit that the flanges or the sheet violate; return None if there is none.
 
         flange, other_flange: world poses (4, 4).
         slack_m: tolerance on the limits of the flange.

@@ -188,6 +188,9 @@ def _sheet_centre(edge: Floats, along_m: float) -> Floats:
 
 
 def _difference(pose: Floats, other: Floats) -> Floats:
-    """Return the rotation vector (rad) and the offset divided by SKEW_LENGTH_M as a vector (6,)."""
+    """Return the difference of two poses as a vector (6,).
+
+    The elements are the rotation vector (rad), and the offset divided by SKEW_LENGTH_M.
+    """
     rotation = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
     return np.concatenate([rotation, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

@@ -192,7 +192,9 @@ def clamp_to_range(
 ) -> Floats:
     """Limit velocities (6,) rad/s so that the joints can stop within their ranges.
 
-    velocity: velocities of the previous step. The result respects the maximum acceleration.
+    velocity: velocities of the previous step.
+
+    The result respects the maximum acceleration.
     """
     max_acceleration = limits.acceleration_rad_per_s2
     up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
@@ -280,7 +282,7 @@ def measure_twist_rad(edge: Floats, other_edge: Floats) -> float:
 
 
 def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
-    """Return a description of the limit that the sheet violates, or None.
+    """Describe the limit that the sheet violates; return None if there is none.
 
     edge, other_edge: world poses (4, 4) of this arm's edge and of the other edge.
     left: whether this arm holds the left edge.
@@ -314,7 +316,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return a description of the violated limit (workspace or flange distance), or None.
+    """Describe the violated limit (workspace or flange distance); return None if there is none.
 
     flange_world, other_flange: world poses (4, 4).
     slack_m: tolerance on both limits.
@@ -339,7 +341,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return a description of a tracking error above the maximum, or None.
+    """Describe a tracking error above the maximum; return None if there is none.
 
     joints_rad, measured_rad: commanded and measured joint angles (6,).
     """

@@ -100,7 +100,10 @@ class OtherArm:
 
     @property
     def interlock_reason(self) -> str | None:
-        """Return the reason why the other arm's state forbids motion of this arm, or None."""
+        """Return the reason why the other arm's state forbids motion of this arm.
+
+        None means that the state permits motion.
+        """
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

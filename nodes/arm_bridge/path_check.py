@@ -229,7 +229,7 @@ def _find_duration_s(
 
 
 class PathChecker:
-    """A runner of path checks in a thread, one check at a time."""
+    """A runner that checks one path at a time in a separate thread."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other
@@ -238,7 +238,7 @@ class PathChecker:
     def poll(
         self, request: PathCheckRequest | None
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
-        """Return a finished request and its result, or None if no check has finished since.
+        """Return a finished request and its result, or None if no check has finished.
 
         The caller must call this method in every cycle.
 

@@ -49,7 +49,8 @@ class LatencyMean:
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
         """Add an exchange with a new target, and ignore exchanges with the same target.
 
-        Returns the mean latency (s) after every REPORTED_TARGETS targets, otherwise None.
+        Returns the mean latency (s) after every REPORTED_TARGETS targets. In between, the result is
+        None.
         """
         target, before = exchange.target, self._target
         self._target = target

@@ -193,7 +193,7 @@ class FaceReader(threading.Thread):
     """A thread that searches the newest image of a camera for eyes.
 
     deliver(at_ns, pixels): called for each searched image, with the time of its exposure and the
-    pixel positions (2, 2) of the eyes. The positions are None if the image shows no face.
+        pixel positions (2, 2) of the eyes. The positions are None if the image shows no face.
     fail(error): called for each DeviceError. The camera is then opened again after a delay.
 
     Both functions are called in the thread itself.

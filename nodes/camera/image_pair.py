@@ -57,8 +57,8 @@ Regions = tuple[Region, Region]
 class ImagePair:
     """A left and a right grey image (height, width) with nearly equal exposure times.
 
-    exposure_ns: mean of both mid-exposure times on the reader's clock; for files, the time since
-        the start of the file.
+    exposure_ns: mean of both mid-exposure times on the reader's clock. If the source is a file, the
+        clock starts at the start of the file.
     exposure_s: duration of the exposure that the device reports; None if unknown.
     skew_s: mid-exposure time of the right image minus mid-exposure time of the left image.
     regions: sensor regions of the images; None means full sensors.
@@ -149,7 +149,7 @@ def describe_skew(skew_s: float, limit_s: float) -> str:
     """Return the reason for the rejection of an image pair, as text.
 
     skew_s: time between the left and the right exposure.
-    limit_s: maximum of this time.
+    limit_s: maximum permitted time.
     """
     return (
         f"{1e3 * skew_s:.1f} ms between left and right exposure, maximum {1e3 * limit_s:g} ms; "

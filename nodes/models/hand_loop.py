@@ -276,7 +276,7 @@ class OffsetBoundsTable:
 
 
 def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
-    """Compute the maximum slopes at which all hands are stable with margins of gain and delay.
+    """Compute the maximum slopes at which all hands are stable, even if gain and delay are larger.
 
     advance_limit: upper limit of the slopes towards the finger.
 

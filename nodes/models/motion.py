@@ -52,7 +52,8 @@ def follow(
 
     error (n,): target at the end of the step minus the current point.
     velocity, target_velocity (n,): current velocities of the point and of the target.
-    max_acceleration: limit of the change of the mean velocity from one step to the next, per time.
+    max_acceleration: maximum change of the mean velocity from one step to the next, divided by
+        `step_s`.
     """
     target_velocity = _clamp_length(target_velocity, max_speed)
     desired = desired_velocity(

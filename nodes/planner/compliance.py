@@ -509,7 +509,7 @@ def _find_best_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Return a warning about forces that the sheet cannot render, or an empty text.
+    """Return a warning about forces that the sheet cannot render, or "" if there are none.
 
     position_error_m: error of the sheet's position. The text also warns of objects so soft that
         this error changes the force noticeably.
@@ -558,7 +558,7 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, str]:
     """Return the stretch that renders an object's stiffness at small pushes without an offset.
 
-    The second result is a text about a stiffness that the sheet cannot render, or an empty text.
+    The second result is a text if the sheet cannot render the stiffness, otherwise it is empty.
 
     The sheet is modelled as linear, and the fingertip as a point.
     """

@@ -229,7 +229,7 @@ class ContactStateMachine:
         """Roll the sheet on the object until the contact is at the surface point `found`.
 
         The contact stays within the usable area of the sheet. The second result is the violated
-        limit, or None.
+        limit, or None if no limit is violated.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])

@@ -23,8 +23,9 @@ MIN_STEP_RATIO = 1.0 / 512.0
 """The resolution of the search of `limit_tilt`, as a fraction of the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""The finer resolution of the search, and the distance from the maximum tilt beyond which the finer
-resolution is used. Deep inside the object, a small step can rotate the normal by many degrees."""
+"""The finer resolution of the search, which is used while the tilt is below the maximum tilt by
+more than NEAR_LIMIT_RAD. Deep inside the object, a small step can rotate the normal by many
+degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +181,7 @@ def limit_tilt(
     """Return the last surface point within the maximum tilt between `start` and `found`.
 
     The second result is whether this point differs from `found`.
+
     front: unit vector (3,) from which the tilt is measured.
 
     The search follows the straight line to `found` in increasing steps, and projects each step onto

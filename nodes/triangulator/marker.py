@@ -29,7 +29,7 @@ Window = tuple[slice, slice]
 """The rows and columns of a rectangular part of an image."""
 
 NEIGHBOURHOOD_PX = 31
-"""The side of the square around a pixel. The mean grey level of the square is the threshold."""
+"""The side of the square around a pixel whose mean grey level is the threshold for this pixel."""
 
 SURROUND_PX = 3
 """The width of the border around a blob. The outermost pixels determine the grey level of the

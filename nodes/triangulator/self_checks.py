@@ -49,8 +49,10 @@ class CameraCheck:
     """The self-checks of the stereo camera and of the marker.
 
     reference_marks: world positions (n, 3), m, of fixed marks that look like the finger's marker.
-    touch_point: world position (3,), m, of a known point that the finger can touch, or None.
-    projector: projector of the scene, which may project check marks on the sheet, or None.
+    touch_point: world position (3,), m, of a known point that the finger can touch; None if no
+        point is known.
+    projector: projector of the scene, which may project check marks on the sheet; None if there is
+        none.
     """
 
     def __init__(

@@ -244,7 +244,7 @@ class SmoothMeshShape:
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
         """Return the nearest surface points of queries (n, 3), and whether they are ambiguous (n,).
 
-        before: nearest points (n, 3) of the previous queries, or None.
+        before: nearest points (n, 3) of the previous queries, or None if there are none.
         """
         if before is None:
             return self._find_global_nearest(queries)
@@ -569,7 +569,7 @@ def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) 
     """Select vertices that are at least `spacing` (m) apart on each side of the surface; return
     their indices.
 
-    Every vertex that is not selected has a selected vertex within that distance on the same side.
+    Every vertex that is not selected has a selected vertex within `spacing` on the same side.
     """
     selected, covered = [], np.zeros(len(vertices), dtype=bool)
     for vertex in range(len(vertices)):

@@ -311,8 +311,8 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that intersect.
 
     A pair intersects if an edge of one triangle passes through the interior of the other triangle.
-    Edges with an end that is a vertex of the other triangle are not considered. Triangles that only
-    touch, or overlap in one plane, are not counted.
+    An edge is not considered if one of its ends is a vertex of the other triangle. Triangles that
+    only touch, or overlap in one plane, are not counted.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)

@@ -37,7 +37,7 @@ CELLS = 32
 MIN_CELL_RADII = 0.3
 """The cell size under the finger, as a multiple of the finger's radius."""
 STEP_RADII = 0.4
-"""The maximum step of the finger's depth, as a multiple of its radius."""
+"""The maximum step of the finger's depth, as a multiple of the finger's radius."""
 PENALTY_PER_MODULUS = 2e5
 """The stiffness of the contact penalty (pressure divided by penetration), in units of E t /
 width^2.
