@@ -25,7 +25,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
 """A relative deviation, a length (m) or an angle (rad) of at most 0.5.
 
-A larger magnitude indicates a mistake in the file.
+A larger magnitude indicates a mistake in the scene file.
 """
 
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]

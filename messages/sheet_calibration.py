@@ -34,7 +34,7 @@ class Fitted(Part):
 class LeftOutRow(Part):
     """A measurement of the sheet's force that was excluded from the fit as an outlier.
 
-    line: line of the measurement in the file, starting at 1.
+    line: line of the measurement in the file of measurements, starting at 1.
     """
 
     line: Annotated[int, Field(ge=1)]
@@ -42,7 +42,7 @@ class LeftOutRow(Part):
 
 
 class SheetTable(Part):
-    """A table of the measured force on the finger divided by the force of the fitted model.
+    """A table of the ratios of the measured force on the finger to the fitted model's force.
 
     Values are interpolated linearly over stretch and position, and by cubics over depth.
     """

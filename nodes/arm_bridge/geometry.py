@@ -116,7 +116,7 @@ class ArmGeometry:
         return pose
 
     def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
-        """Return an upper bound (m) of the edge's motion between two sets of joint angles (6,) rad."""
+        """Return an upper bound (m) of the edge's motion between two joint positions (6,) rad."""
         return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:

@@ -152,9 +152,9 @@ def has_advanced(count: int, before: int, steps: int) -> bool:
 class MxtLink:
     """A driver for a controller that runs an `Mxt` program.
 
-    Late answers are detected by the controller's counter, which must advance by the number of
-    commands since the last answer. After a lost command, the next answer is therefore dropped too.
-    The mode `idle` restarts the comparison of the counter.
+    The controller's counter indicates late answers: it must advance by the number of commands since
+    the last answer. After a lost command, the next answer is therefore dropped too. The mode `idle`
+    restarts the comparison of the counter.
     stale: number of late answers that were dropped.
     """
 

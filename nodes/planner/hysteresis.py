@@ -1,9 +1,9 @@
 """Model the hysteresis of the sheet's rubber.
 
-The force is 1 + h times the elastic force while the finger moves inwards (loading), and 1 - h times
-the elastic force while the finger moves outwards. Here h = r / (2 - r), and r is the fraction of
-the loading energy that the rubber loses. After a reversal, the factor changes linearly with the
-finger's travel.
+While the finger moves inwards (loading), the force is 1 + h times the elastic force. While the
+finger moves outwards, the force is 1 - h times the elastic force. Here h = r / (2 - r), and r is
+the fraction of the loading energy that the rubber loses. After a reversal, the factor changes
+linearly with the finger's travel.
 """
 
 from __future__ import annotations

@@ -83,9 +83,10 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
     """Return the contact after the sheet has rolled to the surface point `found`.
 
-    The displacement of the contact on the sheet is the chord between both points, projected onto
-    the plane halfway between the tangent planes, and scaled to the length of the arc. The
-    displacement is exact on circles. On other curves, the error is of third order in the angle.
+    The displacement of the contact on the sheet follows from the chord between both points. The
+    chord is projected onto the plane halfway between the tangent planes, and scaled to the length
+    of the arc. The displacement is exact on circles. On other curves, the error is of third order
+    in the angle.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))

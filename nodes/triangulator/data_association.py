@@ -1,11 +1,11 @@
 """Associate the markers of each image pair with the finger and with clutter.
 
-Clutter is every marker-like spot that is not the finger's marker, such as a marker outside the
-finger's gate (the region in which the finger is expected). Clutter is tracked too, so clutter is
-not confused with a finger that was hidden or merged with clutter. Markers are assigned to tracks by
-position and brightness with the global nearest neighbour method (Bar-Shalom, Li, Kirubarajan,
-Estimation with Applications to Tracking and Navigation). If another assignment is about as likely,
-no fingertip is reported.
+Clutter is every marker-like spot that is not the finger's marker. A marker outside the finger's
+gate (the region in which the finger is expected) counts as clutter. Clutter is tracked too, so
+clutter is not confused with a finger that was hidden or merged with clutter. Markers are assigned
+to tracks by position and brightness with the global nearest neighbour method (Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation). If another assignment is
+about as likely, no fingertip is reported.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A mark is on the ray of its projector pixel for any position of the sheet. The distance from this
 ray therefore indicates errors of the projector and the camera. The distance from the expected
 surface of the sheet indicates errors of the arms and the camera. Near a finger that pushes the
-sheet, the surface moves in a known ratio to the finger pad, so the marks indicate errors of the
-pad's depth.
+sheet, the surface moves by a known fraction of the pad's motion. There the marks indicate errors of
+the pad's depth.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Benchmark the tracking methods by the error of the predicted finger position."""
+"""Benchmark the tracking methods: measure the error of the predicted finger position."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ SPACING_RATIO = 1.0 / 3.0
 """The minimum distance between jets (local quadratic fits) on the same side of the surface, divided
 by the smoothing length `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""The minimum cosine of the angle between the normal of a local quadratic fit (jet) and the normal
-of a vertex that is used for the fit."""
+"""The minimum cosine of the angle between two normals: of a local quadratic fit (jet), and of a
+vertex that is used for the fit."""
 MAX_CURVATURE_RATIO = 2.0
 """The maximum curvature (1/m) of a local quadratic fit (jet), multiplied by the smoothing length
 `rho` (m)."""
