@@ -718,7 +718,7 @@ class BagReader:
 
 
 def _find_type_name(channel: mcap_records.Channel) -> str:
-    """Return the name of a channel's message type, or the current name if the type was renamed."""
+    """Return the current name of a channel's message type, which may have been renamed."""
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
 

@@ -17,5 +17,5 @@ If one suffix ends with another suffix, the longer suffix is listed first.
 
 
 def find_unit(name: str) -> str:
-    """Return the unit of a value from its name: "1" for a ratio, empty if there is no suffix."""
+    """Return the unit of a value from its name: "1" for a ratio, "" if the name has no suffix."""
     return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")

@@ -52,7 +52,8 @@ SEEDS = 256
 SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
-"""The minimum of |sin(difference / 2)| for at least one joint of two distinct solutions."""
+"""The minimum of |sin(difference / 2)|, which two distinct solutions exceed in at least one joint.
+"""
 
 
 class UnreachableError(FlexsheetError, ValueError):

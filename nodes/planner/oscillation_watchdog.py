@@ -14,12 +14,12 @@ MIN_AMPLITUDE_M = 2e-4
 """The root mean square amplitude of the depth below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""The ratio of the amplitudes in the second and the first half of the window that triggers the
-watchdog."""
+"""The ratio of two amplitudes (second half of the window to first half) that triggers the watchdog.
+"""
 
 STEADY_RATIO = 0.95
-"""The ratio of the amplitudes in the second and the first half of the window above which an
-oscillation does not decay."""
+"""The ratio of two amplitudes (second half of the window to first half) above which an oscillation
+does not decay."""
 
 SUSTAINED_S = 1.5
 """The time after which an oscillation that does not decay triggers the watchdog."""

@@ -104,7 +104,8 @@ STATIONARY_TRACK_TIMEOUT_S = 10.0
 
 MIN_HITS = 3
 TENTATIVE_TRACK_TIMEOUT_S = 0.1
-"""The timeout of a tentative track with fewer than MIN_HITS detections."""
+"""The time since the last detection after which a tentative track is deleted if it has fewer than
+MIN_HITS detections."""
 
 SOLE_CANDIDATE_TIME_S = 1.0
 """The time after which the only visible marker is assigned to the finger, even if it is

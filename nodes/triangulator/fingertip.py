@@ -162,7 +162,7 @@ class StereoDetection:
     def correct_points(
         self, correct: Callable[[TriangulatedPoint], TriangulatedPoint]
     ) -> StereoDetection:
-        """Return the same detection with a correction of all triangulated points."""
+        """Return a copy of this detection in which all triangulated points are corrected."""
         measured = None if self.measured is None else correct(self.measured)
         markers, clutter = (
             tuple(replace(one, measured=correct(one.measured)) for one in candidates)

@@ -47,7 +47,7 @@ MAX_SPREAD_M = 0.004
 """The maximum difference between the offset of a mark and the median offset of all marks."""
 
 MAX_AGE_NS = 300_000_000
-"""The maximum age of the newest frame at the exposure."""
+"""The maximum age of the newest displayed frame at the exposure of an image pair."""
 
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
 """The speed of the marks below which positions are checked, and above which latency is checked."""

@@ -88,11 +88,11 @@ PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
 ITERATIONS = 8
 CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
-"""The last steps of centre (x, y), radius and blur below which a fit has converged. The remaining
-error (squared step divided by blur) is less than 0.001 px."""
+"""The step sizes of centre (x, y), radius and blur below which a fit counts as converged. The
+remaining error (squared step divided by blur) is less than 0.001 px."""
 
 CONVERGED_ELONGATION_PX = 0.05
-"""The last step of the elongation below which the fit of an ellipse has converged."""
+"""The step size of the elongation below which the fit of an ellipse counts as converged."""
 
 MAX_STEP_PX = 0.7
 """The maximum change of a shape parameter in one step of the fit."""

@@ -87,7 +87,7 @@ STRIDE_RATIO = 0.4
 Longer steps could leave the region in which the surface is defined.
 """
 REST_RATIO = 1e-3
-"""The step of the projection, divided by `rho`, below which it counts as converged.
+"""The step of the projection, divided by `rho`, below which the projection counts as converged.
 
 The remaining error is some nanometres in position and about 1e-5 rad in the normal.
 """
