@@ -85,7 +85,7 @@ def join_frames(frames: Sequence[Any]) -> bytes:
 def split_frames(data: bytes) -> list[memoryview]:
     """Return views of the frames of a message that `join_frames` has encoded.
 
-    Raises WireError for invalid data.
+    Raises WireError if the data are invalid.
     """
     view = memoryview(data)
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0

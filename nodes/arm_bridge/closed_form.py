@@ -23,7 +23,7 @@ WRIST_SINGULAR = 1e-7
 """
 
 SHOULDER_SINGULAR_M = 1e-7
-"""The distance of the wrist centre from the axis of J1 below which J1 is fixed."""
+"""The distance of the wrist centre from the axis of J1 below which J1 stays fixed."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
 """The values of |J5| that bound the region of the wrist singularity. Below the first value, J4 may

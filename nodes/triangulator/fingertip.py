@@ -40,7 +40,7 @@ from flexsheet.nodes.triangulator.triangulation import (
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
-"""The standard deviation of the logarithm of a blob's radius divided by the expected radius."""
+"""The standard deviation of the logarithm of a blob's size ratio: its radius / expected radius."""
 
 HEIGHT_SIGMA = 0.25
 """The standard deviation of the logarithm of a brightness ratio: the marker's brightness in the
@@ -51,8 +51,8 @@ MISFIT_SIGMA_PX = 0.5
 into the images."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""The maximum absolute logarithm of a blob's radius divided by the expected radius: 0.55 to 1.8
-times the expected radius."""
+"""The maximum absolute logarithm of a blob's size ratio. The radius is then 0.55 to 1.8 times the
+expected radius."""
 
 SIZE_SIGMAS = 3.5
 """The maximum deviation of a refined marker's radius from the expected radius, in standard

@@ -75,7 +75,7 @@ class MeasuredPath:
 def measure_path(
     scene: Scene, motion: TruePathCase, *, seed: int, noise_px: float = MARKER_NOISE_PX
 ) -> MeasuredPath:
-    """Simulate the measurement of a finger's path by the scene's stereo camera.
+    """Simulate how the scene's stereo camera measures a finger's path.
 
     seed: seed of the random noise.
     noise_px: standard deviation of a marker's centre.

@@ -415,10 +415,11 @@ def intersect_rays(
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Return the barycentric coordinates (n, 3) of the points in triangles nearest to `points` (n,
-    3).
+    """Return the points of triangles that are nearest to `points` (n, 3).
 
     corners (n, 3, 3): one triangle for each point.
+
+    The result contains the barycentric coordinates (n, 3) of the nearest points.
 
     Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
     """
