@@ -19,8 +19,8 @@ class ArmPoseFit(Part):
     used: bool
     reason: str = Field(description="reason why the pose was left out; empty if it was used")
     shift_m: NonNegative = Field(
-        description="distance of the board poses that follow from the camera and from the joint "
-        "angles"
+        description="distance between the board pose from the camera and the board pose from the "
+        "joint angles"
     )
     rotation_rad: NonNegative
     rms_px: NonNegative = Field(

@@ -83,6 +83,7 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
     """Return the angle (rad) by which an axis rotates to become parallel to a vector.
 
     Near a singularity, the vector is short, and the axis may deviate from the vector.
+
     along, across: components of the vector parallel and perpendicular to the axis.
     fixed, near: lengths of the vector at which the permitted deviation is 90 degrees and zero. The
         deviation is reduced by at most MAX_FREE_ROTATION_RAD per step.

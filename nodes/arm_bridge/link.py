@@ -197,6 +197,7 @@ class ConnectedLink(ABC):
     the connection, and closes the connection after a failure. The first reconnection is immediate.
     Before each further attempt, the driver waits for a pause. The first pause is MIN_PAUSE_S. Each
     pause is twice as long as the previous one, up to MAX_PAUSE_S.
+
     connections: number of connections that were opened.
     """
 

@@ -193,6 +193,7 @@ def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
     right_from_left: transform (4, 4).
 
     Returns points (n, 3), m, in the left camera's frame.
+
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
     """
     projections = (np.eye(3, 4), right_from_left[:3])
@@ -309,6 +310,7 @@ def measure(
 
     Both views have equal weights. The covariances are therefore propagated by (J^T J)^-1 J^T, with
     the Jacobian J of the four pixel coordinates with respect to the point.
+
     Returns None if the point is not in front of both cameras, or if a pixel is invalid for the lens
     model.
     """
