@@ -356,8 +356,8 @@ def _directions(
     """Return unit directions and lengths of offsets (..., 3), and whether each offset is zero.
 
     across: indices of the coordinates in which the offsets may differ from zero. If an offset is
-        zero, the direction from the origin to the previous point is returned, or `FRONT` if there is no
-        previous point.
+        zero, the direction from the origin to the previous point is returned, or `FRONT` if there
+        is no previous point.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)
