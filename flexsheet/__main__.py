@@ -85,7 +85,7 @@ def _shorten_imports() -> None:
 
 
 def _avoid_garbage_collection() -> None:
-    """Collect garbage rarely and not at exit, because it takes a sixth of a command's time."""
+    """Collect garbage rarely and not at exit, to save a sixth of a command's time."""
     gc.set_threshold(100_000)
     atexit.register(gc.freeze)
 

@@ -1,12 +1,13 @@
 """Define the apparatus: the true parameters of the simulated hardware.
 
-The nodes assume the parameters in the scene file. The apparatus contains how the simulated hardware
+The nodes assume the parameters in the scene file. The apparatus states how the simulated hardware
 deviates from the scene. Only the simulator and the evaluation of experiments read the apparatus.
 
 An offset is the true value minus the value in the scene. A ratio is the true value divided by the
-value in the scene. Without deviations, all offsets are zero and all ratios are one. A rotation
-offset is a rotation vector about the world's axes, through the origin of the rotated frame. For the
-clamped edge of the sheet, the rotation vector is about the flange's axes.
+value in the scene. If the hardware does not deviate from the scene, all offsets are zero and all
+ratios are one. A rotation offset is a rotation vector about the world's axes, through the origin of
+the rotated frame. For the clamped edge of the sheet, the rotation vector is about the flange's
+axes.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ class CameraTruth(Part):
     )
     skew_s: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
         default=0.0,
-        description="exposure time of the right image minus that of the left image; the camera "
-        "does not report it",
+        description="exposure time of the right image minus exposure time of the left image, which "
+        "the camera does not report",
     )
     exposure_jitter_s: Annotated[float, Field(ge=0, le=0.05)] = Field(
         default=0.0,
@@ -225,7 +226,7 @@ class GaugeTruth(Part):
         default=0.0, description="standard deviation of a reading"
     )
     offset_n: Annotated[float, Field(ge=-10, le=10)] = Field(
-        default=0.0, description="reading without a force"
+        default=0.0, description="reading while no force acts"
     )
     gain_ratio: NearOne = 1.0
     lag_s: Annotated[float, Field(ge=0, le=1)] = Field(
@@ -236,7 +237,8 @@ class GaugeTruth(Part):
 class EyesTruth(Part):
     """The deviations of the true eye positions from the positions that the renderer assumes.
 
-    The renderer assumes the positions from a head tracker or, without a tracker, from the scene.
+    The renderer uses the positions that a head tracker measures. If there is no head tracker, the
+    renderer uses the positions in the scene.
     """
 
     centre_offset_m: SmallTriple = ZERO_3
@@ -250,7 +252,7 @@ class EyesTruth(Part):
 
 
 NOMINAL_DISPLAY_LATENCY_S = 0.008
-"""The nominal display latency, in seconds, from which `latency_offset_s` is the deviation.
+"""The nominal display latency, in seconds, to which `latency_offset_s` is added.
 
 The display latency is the time from the swap of an image to the middle of its display.
 """
@@ -269,7 +271,7 @@ class ProjectorTruth(Part):
 
 
 class Devices(Part):
-    """The parameters of all devices in a scene, without the virtual object."""
+    """The parameters of all devices in a scene. The virtual object is not included."""
 
     camera: StereoCamera
     arms: Arms
@@ -290,7 +292,7 @@ class Apparatus(Message):
     origin: str = Field(default="file", description="origin of the values, as text for users")
     nominal: Devices | None = Field(
         default=None,
-        description="devices to which the deviations refer; null: those of the scene",
+        description="devices to which the deviations refer; null: the devices of the scene",
     )
     camera: CameraTruth = Field(default_factory=CameraTruth)
     arms: ArmsTruth = Field(default_factory=ArmsTruth)

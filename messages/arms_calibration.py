@@ -19,11 +19,13 @@ class ArmPoseFit(Part):
     used: bool
     reason: str = Field(description="reason why the pose was left out; empty if it was used")
     shift_m: NonNegative = Field(
-        description="distance between the board poses from the camera and from the joint angles"
+        description="distance between the board pose from the camera and the board pose from the "
+        "joint angles"
     )
     rotation_rad: NonNegative
     rms_px: NonNegative = Field(
-        description="reprojection error of the corners, with the pose from the joint angles"
+        description="reprojection error of the corners if the board pose follows from the joint "
+        "angles"
     )
 
 
@@ -44,7 +46,7 @@ class ArmBase(Part):
     )
     jackknife_ratio: NonNegative = Field(
         description="scatter of the fits that leave out one pose, divided by the scatter that the "
-        "covariance predicts; if above 1, the covariance was multiplied by its square"
+        "covariance predicts; if above 1, the covariance was multiplied by the square of this ratio"
     )
     max_change_m: NonNegative = Field(
         description="maximum change of the base's position when one pose is left out"
@@ -63,7 +65,7 @@ class ArmBase(Part):
 class ArmsCalibration(Part):
     """The calibrated poses of the bases of both arms.
 
-    An arm that was not calibrated is null.
+    If an arm was not calibrated, its field is null.
     """
 
     version: Literal[1] = 1
@@ -79,7 +81,7 @@ class ArmsCalibration(Part):
 def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
     """Write the calibration of the arm bases to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

@@ -5,7 +5,7 @@ The MCAP format leaves these details to the application:
 - The profile is "flexsheet". Each message type has a schema (JSON Schema). Each topic has a channel
   with the encoding "flexsheet/2". The channel's metadata contain the fingerprint of the type.
 - `log_time` is when the recorder received the message, and `publish_time` is the source timestamp
-  in the message's header. Both are in ns of a monotonic clock, not since 1970.
+  in the message's header. Both are times of a monotonic clock, in ns, and do not count from 1970.
 - The data of a message are its frames (byte strings of a ZeroMQ multipart message). The data begin
   with the number of frames (uint32), four zero bytes, and the length of each frame (uint64). Then
   the frames follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays
@@ -85,20 +85,21 @@ def join_frames(frames: Sequence[Any]) -> bytes:
 def split_frames(data: bytes) -> list[memoryview]:
     """Return views of the frames of a message that `join_frames` has encoded.
 
-    Raises WireError for invalid data.
+    Raises WireError if the data are invalid.
     """
     view = memoryview(data)
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0
     offset = 8 + 8 * count
     if not count or offset > len(view):
-        raise WireError("malformed", "the recorded bytes are not a message's frames")
+        raise WireError("malformed", "the recorded message does not begin with its frame lengths")
     frames = []
     for length in struct.unpack_from(f"<{count}Q", view, 8):
         frames.append(view[offset : offset + length])
         offset += length + -length % 8
     if offset != len(view):
         raise WireError(
-            "malformed", f"the recorded frames have {len(view)} bytes, expected {offset}"
+            "malformed",
+            f"the recorded message has {len(view)} bytes, but its frame lengths require {offset}",
         )
     return frames
 
@@ -111,8 +112,8 @@ class BagWriter:
     power failure, slightly more may be lost.
 
     metadata: named tables of text that identify the recording (clock, hosts, git state).
-    compress: whether to compress chunks of about 1 MiB by zstd. Without compression, images are
-        written faster but need more disk space.
+    compress: whether to compress chunks of about 1 MiB with zstd. If chunks are not compressed,
+        images are written faster but need more disk space.
 
     Raises BagError if the file exists or cannot be created.
     """
@@ -355,7 +356,7 @@ class AttachmentInfo:
 class BagInfo:
     """A summary of a bag. All times are on the recorder's clock.
 
-    problem: reason why the bag is incomplete; empty for a complete bag.
+    problem: reason why the bag is incomplete; empty if the bag is complete.
     """
 
     path: Path
@@ -376,7 +377,7 @@ class BagReader:
     Iteration yields (topic name, message, header, log time in ns), in the order of log time. The
     log time is the time when the recorder received the message.
 
-    topics: names of the topics to read; None: all topics.
+    topics: names of the topics to read; None means all topics.
     start_ns, end_ns: range of log time to read. A message at `end_ns` is not included.
 
     Raises BagError if the file cannot be read or is not a bag, or if a topic name is unknown.
@@ -489,8 +490,8 @@ class BagReader:
     def attachment(self, name: str) -> bytes:
         """Return the content of the attachment with the given name.
 
-        If several attachments have this name, return the newest one. Raises BagError if there is
-        none.
+        If several attachments have this name, the newest one is returned. Raises BagError if no
+        attachment has this name.
         """
         for one in reversed(self.attachments):
             if one.name == name:
@@ -717,7 +718,7 @@ class BagReader:
 
 
 def _find_type_name(channel: mcap_records.Channel) -> str:
-    """Return the name of a channel's message type, or the current name if the type was renamed."""
+    """Return the current name of a channel's message type, which may have been renamed."""
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
 
@@ -733,7 +734,7 @@ class RecoverReport:
 
     messages, attachments: numbers of recovered messages and attachments.
     was_complete: whether the original bag was complete.
-    problem: reason why the original bag was incomplete; empty for a complete bag.
+    problem: reason why the original bag was incomplete; empty if it was complete.
     orphan_messages: number of messages that were not recovered because the bag does not describe
         their channel.
     """
@@ -754,7 +755,8 @@ def recover(
 ) -> RecoverReport:
     """Write the readable part of a truncated or damaged bag to a new bag.
 
-    progress: function that is called with the numbers of processed and of all chunks.
+    progress: function that is called with the number of processed chunks and the total number of
+        chunks.
 
     Raises BagError if nothing is readable, or if the new file exists or cannot be written.
     """

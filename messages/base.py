@@ -19,7 +19,7 @@ class StampMark:
 Stamp = Annotated[int, StampMark()]
 """A timestamp, in ns, on the clock of the message's header. The value 0 means no timestamp.
 
-When a message arrives from another host, these fields are converted to the clock of the receiving
+When a message arrives from another host, its timestamps are converted to the clock of the receiving
 host. A field that contains a duration has the type `int` instead.
 """
 

@@ -2,12 +2,12 @@
 
 A publisher binds its socket and subscribers connect to it, in any order. Publishers and subscribers
 may be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
-calls the handler there. This design has the smallest latency of those in `benchmarks/messaging.py`.
-No `recv` is ever pending, so no cancelled `recv` can lose a message.
+calls the handler there. `benchmarks/messaging.py` compares this design with others; this design has
+the smallest latency. No `recv` is ever pending, so no cancelled `recv` can lose a message.
 
 A subscriber has one socket per host, which identifies the host of each message. From each host, the
 subscriber accepts only messages of the nodes that run there. Sockets that other computers can reach
-are bound and connected with keys only (`flexsheet.messages.security`).
+always use keys (`flexsheet.messages.security`).
 
 The file descriptor of a ZeroMQ socket is edge-triggered: its signal means that the state of the
 socket has changed, not that a message is ready. Any call on the socket can clear the signal. Each
@@ -156,7 +156,7 @@ def compute_queue_length(topic: Topic) -> int:
 class Source:
     """An endpoint to which a subscriber connects.
 
-    writer: name of the node that publishes at the endpoint; None: any node.
+    writer: name of the node that publishes at the endpoint; None means any node.
     host: name of the host at the endpoint. If keys are used, the endpoint must have the key of this
         host.
     """
@@ -173,9 +173,10 @@ class Publisher:
     given.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port". "tcp://127.0.0.1:*" selects a free port.
-    keys: keys of the hosts that may connect over tcp; None: tcp is bound to the loopback interface.
-    on_refused: function that is called with a text for each refused or closed connection. Without a
-        running loop, a separate thread calls the function.
+    keys: keys of the hosts that may connect over tcp. If None, tcp is bound to the loopback
+        interface.
+    on_refused: function that is called with a text for each refused or closed connection. If no
+        event loop is running, a separate thread calls the function.
     local: bus that passes messages to subscribers in this process without encoding. The socket is
         then used only while another process has subscribed.
     """
@@ -364,16 +365,16 @@ class Subscriber:
     connect: endpoints of all nodes that publish the topic. A node may start after the subscriber,
         and may restart.
     counts: counters of superseded, lost and rejected messages.
-    on_problem: function that is called with a text about a problem: the first rejection of each
+    on_problem: function that is called with a text about a problem: the first rejection for each
         cause, and each exception in `on_message`. Lost messages are a problem each time their
         number has doubled, except on topics with the delivery `latest`.
-    on_handshake_failed: function that is called with a text for each kind of failed handshake;
-        None: `on_problem` is called.
+    on_handshake_failed: function that is called with a text for each kind of failed handshake. If
+        None, `on_problem` is called.
     raw: whether `on_message(frames, header)` is called with the undecoded frames of every message.
         The fields are then not validated.
-    keys: keys of this host and of the other hosts; None: tcp connects to the loopback interface
+    keys: keys of this host and of the other hosts. If None, tcp connects to the loopback interface
         only.
-    plan: hash of the resolved launch file whose messages are accepted; None: all messages are
+    plan: hash of the resolved launch file whose messages are accepted. If None, all messages are
         accepted.
     message_filter: function that is called with each valid message before `on_message`.
     on_disconnected: function that is called when a connection has ended, after its last message.
@@ -483,7 +484,7 @@ class Subscriber:
 
         Return False if the message is rejected, or if it has arrived before.
 
-        writers: names of the nodes that may publish at the endpoint; None: any node.
+        writers: names of the nodes that may publish at the endpoint; None means any node.
         """
         try:
             if writers is not None and header.writer not in writers:
@@ -545,7 +546,7 @@ class Subscriber:
             )
 
     def reject(self, error: WireError) -> None:
-        """Count a rejected message. Report only the first rejection of each cause."""
+        """Count a rejected message. Report only the first rejection for each cause."""
         self.counts.rejected += 1
         if error.cause not in self._reported_causes:
             self._reported_causes.add(error.cause)

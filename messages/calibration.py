@@ -68,14 +68,14 @@ class Uncertainty(Part):
     )
     jackknife_ratio: NonNegative = Field(
         description="scatter of fits that leave out some pairs, divided by the scatter that the "
-        "covariance predicts; if above 1, the covariance was multiplied by its square"
+        "covariance predicts; if above 1, the covariance was multiplied by the square of this ratio"
     )
     working_distance_m: Positive = Field(description="depth to which the next two values apply")
     depth_std_m: NonNegative = Field(
         description="error of a fingertip along the left camera's optical axis"
     )
     lateral_std_m: NonNegative = Field(
-        description="error of a fingertip across this axis, x and y together"
+        description="error of a fingertip perpendicular to this axis, x and y together"
     )
     parameters: tuple[str, ...] = Field(description="names of the covariance's rows and columns")
     covariance: Covariance
@@ -86,9 +86,11 @@ class StereoCalibration(Part):
 
     version: Literal[2] = 2
     device: str
-    date: str = Field(description="ISO 8601, UTC")
+    date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
-    opencv_version: str | None = Field(default=None, description="null: computed without OpenCV")
+    opencv_version: str | None = Field(
+        default=None, description="version of OpenCV; null: computed without OpenCV"
+    )
     width_px: Annotated[int, Field(gt=0)]
     height_px: Annotated[int, Field(gt=0)]
     left: Lens
@@ -96,7 +98,9 @@ class StereoCalibration(Part):
     right_from_left: Transform
     board: Board
     reprojection_rms_px: NonNegative
-    uncertainty: Uncertainty | None = Field(default=None, description="null: unknown")
+    uncertainty: Uncertainty | None = Field(
+        default=None, description="uncertainty of the calibration; null: unknown"
+    )
     pairs: tuple[PairResidual, ...]
 
 
@@ -123,7 +127,7 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
 def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
     """Write a stereo calibration to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

@@ -35,7 +35,7 @@ class CalibrationFileError(FlexsheetError, ValueError):
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
-    """Raised if a calibration belongs to another camera, sheet or device than the scene's."""
+    """Raised if a calibration was made for a camera, sheet or device that is not in the scene."""
 
     code = "calibration-mismatch"
     exit_code = 2
@@ -48,7 +48,8 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
     An existing file is replaced only after the new file has been written completely.
 
     title: first comment line of the file.
-    comment: second comment line, such as the command that wrote the file; empty for none.
+    comment: second comment line, such as the command that wrote the file; empty if there is no
+        second comment line.
 
     Raises FileWriteError if the file cannot be written.
     """

@@ -21,7 +21,7 @@ MAX_STAMP_AHEAD_NS = 20_000_000
 class ClockTable:
     """A table of the offsets between the clocks of other hosts and the local clock.
 
-    The offsets are those in the newest `Clocks` message.
+    The offsets are taken from the newest `Clocks` message.
     """
 
     def __init__(self, clock_id: str) -> None:
@@ -31,12 +31,12 @@ class ClockTable:
         self.offsets: dict[str, ClockOffset] = {}
 
     def update(self, clocks: Clocks) -> None:
-        """Replace all offsets by those in a new message of the clock node."""
+        """Replace all offsets by the offsets in a new message of the clock node."""
         self._limit_s, self._max_drift = clocks.max_offset_uncertainty_s, clocks.max_drift_ratio
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
     def find_problem(self, clock_id: str, now_ns: int) -> str:
-        """Return the reason why the offset of a clock is too inaccurate, or "".
+        """Return the reason why the offset of a clock is too inaccurate, or "" if it is accurate.
 
         now_ns: current time on the local clock.
         """

@@ -1,9 +1,9 @@
-"""Close tcp connections on which a peer sends a publisher more data than a subscriber would.
+"""Close tcp connections on which a peer sends a publisher more data than a subscriber sends.
 
-A ZeroMQ publisher stores every subscription that a peer sends, in about 45 times its size. The
-subscriptions are stored in the call that sends the next message. This call does not return while
-more subscriptions arrive. ZeroMQ has no option that limits the number of subscriptions or the
-number of frames in a message.
+A ZeroMQ publisher stores every subscription that a peer sends. A stored subscription needs about 45
+times as much memory as the received data. The subscriptions are stored in the call that sends the
+next message. This call does not return while more subscriptions arrive. ZeroMQ has no option that
+limits the number of subscriptions or the number of frames in a message.
 
 A subscriber of this package sends only a handshake, one subscription, and one reply to each
 heartbeat. A thread therefore counts the bytes that the kernel has received on each accepted

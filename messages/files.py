@@ -30,7 +30,7 @@ class FileWriteError(FlexsheetError, OSError):
 def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> None:
     """Write a file atomically. If writing fails, an existing file remains unchanged.
 
-    mode: file permissions; None: the default permissions of the process.
+    mode: file permissions; None means the default permissions of the process.
 
     Raises FileWriteError if the file cannot be written.
     """
@@ -56,7 +56,7 @@ def make_write_error(
 ) -> FileWriteError:
     """Make the error for a file that could not be written, with a remedy that fits the cause.
 
-    needed_bytes: size of the file, which the error text contains if the disk is full; None:
+    needed_bytes: size of the file, which the error text contains if the disk is full; None if
         unknown.
     """
     text = f"{path}: cannot be written: {error.strerror or error}"

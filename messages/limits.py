@@ -154,9 +154,14 @@ def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
         raise ValueError("the last row of a rigid transform must be [0, 0, 0, 1]")
     rotation = matrix[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR:
-        raise ValueError("the upper left 3x3 must be a rotation: rows of length 1 at right angles")
+        raise ValueError(
+            "the upper left 3x3 block must be a rotation matrix (perpendicular rows of length 1, "
+            "determinant +1)"
+        )
     if np.linalg.det(rotation) < 0.0:
-        raise ValueError("the upper left 3x3 is a reflection; negate one of its axes")
+        raise ValueError(
+            "the upper left 3x3 block is a reflection, not a rotation; negate one of its columns"
+        )
 
 
 @cache

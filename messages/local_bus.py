@@ -1,10 +1,10 @@
 """Deliver messages between the nodes of one process without encoding them.
 
 A publisher passes each message to the subscribers in its process. The socket is used only while
-another process has subscribed. A subscriber applies the same checks as to
-messages from sockets: writer, plan, order, types, shapes and ranges. Arrays of at most
-`INLINE_BYTES` are copied, because a sender may reuse their memory. Larger arrays are shared. All
-arrays are read-only for the subscribers.
+another process has subscribed. A subscriber checks the same properties as for messages from
+sockets: writer, plan, order, types, shapes and ranges. Arrays of at most `INLINE_BYTES` are copied,
+because a sender may reuse their memory. Larger arrays are shared. All arrays are read-only for the
+subscribers.
 
 A message handler runs in a callback of the event loop after the sender's callback, never inside
 `send`.
@@ -146,7 +146,8 @@ class LocalChannel:
 class LocalBus:
     """The set of all message channels inside one process.
 
-    endpoints: endpoints to which the publishers of this process bind. Each has one channel.
+    endpoints: endpoints to which the publishers of this process bind. Each endpoint has one
+        channel.
     """
 
     def __init__(self, endpoints: Iterable[str]) -> None:
@@ -160,7 +161,7 @@ class LocalBus:
 class LocalConnection:
     """A connection of a subscriber to publishers in its own process.
 
-    writers: names of the nodes whose messages are accepted; None: any node.
+    writers: names of the nodes whose messages are accepted; None means any node.
     max_waiting: maximum number of messages in the queue. A full queue drops the newest message, and
         the subscriber counts it as lost.
     """

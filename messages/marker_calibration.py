@@ -28,14 +28,14 @@ class MarkerCalibration(Part):
     )
     scene: str = Field(description="name of the scene in which the finger was calibrated")
     marker_from_pad_m: FingerLengths = Field(
-        description="marker's centre relative to the pad's contact point, finger's frame"
+        description="marker's centre relative to the pad's contact point, in the finger's frame"
     )
     standard_deviations_m: tuple[NonNegative, NonNegative, NonNegative]
     covariance_m2: tuple[Triple, ...] | None = Field(
         default=None,
         min_length=3,
         max_length=3,
-        description="covariance of the position; not given: uncorrelated components",
+        description="covariance of the position; if not given, the components are uncorrelated",
     )
     point_offset_m: FingerLengths = Field(
         description="mean estimated error of the touched points, world frame"
@@ -64,7 +64,7 @@ def save_marker_calibration(
 ) -> None:
     """Write a marker calibration to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

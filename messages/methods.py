@@ -47,7 +47,7 @@ class Methods(BaseModel):
     soft_body: SoftBodyChoice | None = None
     compliance: ComplianceMode | None = Field(
         default=None,
-        description="how the sheet renders the object's force; constant_stretch: it does not",
+        description="how the sheet renders the object's force; constant_stretch: not at all",
     )
 
 
@@ -55,7 +55,7 @@ def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: 
     """Return the method that a node uses.
 
     parameter: value of the node's parameter; "auto" selects the scene's choice.
-    by_scene: choice of the scene; None selects `default`.
+    by_scene: choice of the scene; None means `default`.
     """
     if parameter != "auto":
         return parameter

@@ -80,7 +80,8 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
 }
 """The current names of literal values that have been renamed.
 
-The keys are the message type with the current field name, and the former value.
+The key of each table is the message type and the current name of the field. The table contains the
+current values by former value.
 """
 
 SHEET_REASONS = {
@@ -253,7 +254,7 @@ def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the model class in an annotation, or None unless it contains exactly one."""
+    """Return the model class in an annotation, or None if it contains no or several models."""
     options = [annotation, *get_args(annotation)]
     models = [one for one in options if isinstance(one, type) and issubclass(one, BaseModel)]
     return models[0] if len(models) == 1 else None
@@ -323,7 +324,7 @@ def _resolve(schema: Any, parts: Schema) -> Any:
         if not (isinstance(schema, Mapping) and "$ref" in schema):
             return schema
         schema = parts[str(schema["$ref"]).rpartition("/")[2]]
-    raise TypeError("cyclic reference")
+    raise TypeError("the JSON Schema contains a cycle of references")
 
 
 def _options(schema: Schema) -> list[Any]:

@@ -25,7 +25,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
 """A relative deviation, a length (m) or an angle (rad) of at most 0.5.
 
-A larger magnitude indicates a mistake in the file.
+A larger magnitude indicates a mistake in the scene file.
 """
 
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
@@ -125,7 +125,9 @@ class Mesh(Part):
 
     shape: Literal["mesh"] = "mesh"
     vertices_m: Vertices
-    triangles: Triangles = Field(description="vertex indices, counter-clockwise from outside")
+    triangles: Triangles = Field(
+        description="vertex indices, counter-clockwise when seen from outside"
+    )
     smoothing_m: Positive = Field(description="length below which details and edges are smoothed")
     origin: str = Field(description="source file and repairs, for information")
 
@@ -279,7 +281,8 @@ class VirtualObject(Part):
 class SheetSpec(Part):
     """The rubber sheet, clamped at its left and right edges and free at its top and bottom edges.
 
-    The x axis points from the left to the right edge, and the y axis along the edges.
+    In the sheet frame, the x axis points from the left to the right edge, and the y axis points
+    along the edges.
     """
 
     width_m: Positive = Field(
@@ -436,8 +439,8 @@ ARM_MODELS = {arm.name: arm for arm in (RV_1A, RV_2FR)}
 class ArmSpec(Part):
     """A robot arm: its model, the pose of its base, and the pose of the sheet's edge on its flange.
 
-    In the sheet frame, x points from the left to the right edge, y along the edges, and z towards
-    the user.
+    In the sheet frame, the x axis points from the left to the right edge. The y axis points along
+    the edges, and the z axis towards the user.
     """
 
     model: Annotated[ClosedFormArm | JointChain, Field(discriminator="kind")] = Field(
@@ -497,9 +500,10 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """The parameters of the stereo camera. Each camera frame has x to the right, y down, z ahead.
+    """The parameters of the stereo camera.
 
-    The z axis is the optical axis of the camera.
+    In each camera frame, the x axis points to the right in the image, and the y axis down. The z
+    axis is the optical axis of the camera, and points forwards.
     """
 
     device: str

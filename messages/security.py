@@ -166,7 +166,7 @@ class KeyRing:
         self.reload()
 
     def find_host(self, key: str) -> str | None:
-        """Return the name of the host with a public key, or None if no host has this key."""
+        """Return the name of the host that has a public key, or None if no host has this key."""
         return self._host_by_key.get(key)
 
     def reload(self) -> KeyChange | None:
@@ -218,7 +218,7 @@ class KeyRing:
         opened.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def set_client_keys(self, opened: zmq.Socket[bytes], host: str) -> None:
-        """Set the keys of a client socket, so that the server must have the key of a host.
+        """Set the keys of a client socket, so that the server must have the key of the given host.
 
         This applies to all endpoints that are connected after this call. Raises SecurityError if
         the host has no key.
@@ -319,7 +319,7 @@ class ZapAuthenticator:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return modification time (ns), inode and size (bytes) of a file, or None if it is missing."""
+    """Return a file's modification time (ns), inode and size (bytes), or None if it is missing."""
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -34,7 +34,7 @@ class Fitted(Part):
 class LeftOutRow(Part):
     """A measurement of the sheet's force that was excluded from the fit as an outlier.
 
-    line: line of the measurement in the file, starting at 1.
+    line: line of the measurement in the file of measurements, starting at 1.
     """
 
     line: Annotated[int, Field(ge=1)]
@@ -42,7 +42,7 @@ class LeftOutRow(Part):
 
 
 class SheetTable(Part):
-    """A table of the measured force on the finger divided by the force of the fitted model.
+    """A table of the ratios of the measured force on the finger to the fitted model's force.
 
     Values are interpolated linearly over stretch and position, and by cubics over depth.
     """
@@ -57,11 +57,12 @@ class SheetTable(Part):
 class SheetCalibration(Part):
     """The calibration of a rubber sheet.
 
-    The file contains the fitted parameters of the force model, and the range of the measurements.
+    The calibration contains the fitted parameters of the force model, and the range of the
+    measurements.
     """
 
     version: Literal[1] = 1
-    date: str = Field(description="ISO 8601, UTC")
+    date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
     source: str = Field(description="file of the measurements, or scene of the simulator")
     nominal_width_m: Positive = Field(
@@ -73,7 +74,8 @@ class SheetCalibration(Part):
     modulus_thickness_n_per_m: Fitted
     slack_width_m: Fitted
     cubic_ratio: Fitted = Field(
-        description="cubic term of the unstretched sheet's force, divided by that of ideal rubber"
+        description="cubic term of the unstretched sheet's force, divided by the cubic term of "
+        "ideal rubber"
     )
     mooney_ratio: Fitted | None = Field(
         default=None, description="Mooney-Rivlin constants C2/(C1+C2); null: not fitted"
@@ -117,7 +119,7 @@ def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
 def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
     """Write a sheet calibration to a YAML file.
 
-    comment: comment line at the start of the file; empty for none.
+    comment: comment line at the start of the file; empty if there is no comment.
 
     Raises FileWriteError if the file cannot be written.
     """

@@ -34,11 +34,12 @@ class Delivery(StrEnum):
 class Topic:
     """A topic: a named stream of messages of one type.
 
-    rate_hz: expected minimum and maximum rate, for health checks; None: no expected rate.
+    rate_hz: expected minimum and maximum rate, for health checks; None if no rate is expected.
     logged: whether the topic is recorded by default.
-    many_writers: whether any number of nodes may publish the topic; otherwise exactly one node.
+    many_writers: whether any number of nodes may publish the topic; if false, only one node may.
     max_bytes: maximum size of a message, checked when it is sent and when it is received.
-    open_to_tools: whether command-line tools may publish the topic, if any number of nodes may.
+    open_to_tools: whether command-line tools may publish the topic; only used if `many_writers` is
+        true.
     """
 
     name: str

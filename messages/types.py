@@ -44,7 +44,7 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "
 class StereoPair(Message):
     """A pair of images of the stereo camera.
 
-    The source timestamp is the midpoint of the exposure. Without a common trigger of both cameras,
+    The source timestamp is the midpoint of the exposure. If the two cameras have no common trigger,
     the timestamp is the mean of the midpoints of both exposures.
     """
 
@@ -144,7 +144,7 @@ SheetReason = Literal[
 ]
 """The reason why the sheet does not follow the finger; "ok" while the sheet follows.
 
-With "concave_contact", the sheet follows the finger at a distance.
+If the reason is "concave_contact", the sheet follows the finger at a distance.
 """
 
 
@@ -247,7 +247,8 @@ class ArmState(Message):
     )
     trajectory_ends_ns: Stamp = Field(
         default=0,
-        description="end of the target's trajectory that the arm may follow; 0: not at all",
+        description="end of the target's trajectory that the arm may follow; 0: the arm follows no "
+        "trajectory",
     )
     command_sent_ns: Stamp = Field(description="time of the newest command to the arm; 0: none")
     edge_distance_m: NonNegative | None = Field(
@@ -292,7 +293,7 @@ ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
 
 
 class SoftBody(Message):
-    """The deformation of the soft body under the finger, and its force on the finger."""
+    """The deformation of the soft body under the finger, and the body's force on the finger."""
 
     mesh_id: str
     method: str
@@ -316,7 +317,7 @@ class SoftBody(Message):
     )
     in_transition: bool = Field(
         default=False,
-        description="true: `method` gradually replaces another one, which still contributes",
+        description="true: `method` gradually replaces another method, which still contributes",
     )
     displacement_world_m: Points3
 
@@ -357,7 +358,7 @@ class Force(Message):
 class Eye(Message):
     """The positions of the user's eyes, measured by a head tracker.
 
-    Without a head tracker, nodes use the positions in the scene.
+    If there is no head tracker, nodes use the positions in the scene.
     """
 
     valid: bool = Field(
@@ -539,7 +540,7 @@ class ClockOffset(MessagePart):
     offset_ns: int
     uncertainty_s: NonNegative = Field(description="maximum error of the offset")
     drift_ratio: Finite = Field(
-        description="rate of the other clock divided by that of the header's clock, minus one"
+        description="rate of the other clock divided by the rate of the header's clock, minus one"
     )
     resets: int = Field(ge=0, description="number of detected jumps of the clock")
 
@@ -574,7 +575,7 @@ SuspectedCause = Literal[
 ]
 """The suspected cause of a deviation between a measured and an expected value.
 
-`flexsheet.messages.notes` describes each cause. With a value that contains "or", the data cannot
+`flexsheet.messages.notes` describes each cause. If a value contains "or", the data cannot
 distinguish the two causes.
 """
 

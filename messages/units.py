@@ -10,9 +10,12 @@ UNITS = {
     "_deg": "°", "_px": "px", "_kg": "kg", "_pa": "Pa", "_bytes": "bytes", "_ratio": "1",
     "_ms": "ms", "_mm": "mm", "_n": "N", "_m": "m", "_s": "s",
 }  # fmt: skip
-"""The units by suffix of a name. A longer suffix stands before a shorter one that it ends with."""
+"""The units by suffix of a name.
+
+If one suffix ends with another suffix, the longer suffix is listed first.
+"""
 
 
 def find_unit(name: str) -> str:
-    """Return the unit of a value from its name: "1" for a ratio, empty if there is no suffix."""
+    """Return the unit of a value from its name: "1" for a ratio, "" if the name has no suffix."""
     return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")

@@ -60,8 +60,8 @@ The decoded values need up to 64 times as much memory.
 MAX_ELEMENTS = 4096
 """The maximum number of elements of an array or a map in the header frame.
 
-The limit protects the memory. The decoder allocates the stated length before it reads the elements,
-and arrays can be nested.
+The limit prevents a short message from filling the memory. The decoder allocates the stated length
+before it reads the elements, and arrays can be nested.
 """
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
@@ -111,7 +111,7 @@ def encode(
 ) -> list[Buffer]:
     """Encode a message as frames (byte strings of a ZeroMQ multipart message).
 
-    max_bytes: maximum size of the message; None: no limit.
+    max_bytes: maximum size of the message; None means no limit.
     inline_bytes: maximum size of an array inside the header frame. Each larger array is a frame.
 
     Raises WireError if a field cannot be encoded, or if the message is too large.
@@ -186,8 +186,8 @@ def read_envelope(
 
     frames: buffers (bytes, memoryview or zmq.Frame). The first buffer is the header.
     expected: topic or message type. A topic also limits the size of the message.
-    fingerprint, type_name: fingerprint and name of a recorded message type; None: those of the
-        current type.
+    fingerprint, type_name: fingerprint and name of a recorded message type; None means the values
+        of the current type.
 
     Raises WireError if the message is invalid or unexpected.
     """

@@ -83,8 +83,8 @@ class UnknownNodeError(FlexsheetError, KeyError):
 def node_class(name: str) -> type[Node]:
     """Import and return the class of a node type, which is a name in `NODES` or "module:Class".
 
-    Module names without the package, such as "nodes.planner.node" in old launch files and bags, are
-    accepted. Raises UnknownNodeError for an unknown name, ImportError for a missing module, and
+    The package name may be missing, as in "nodes.planner.node:Planner" in old launch files and
+    bags. Raises UnknownNodeError for an unknown name, ImportError for a missing module, and
     AttributeError for a missing class.
     """
     path = NODES.get(name, name)

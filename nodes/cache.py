@@ -63,7 +63,7 @@ class Specification(Generic[T]):
     def path(self, cache_dir: Path | None) -> Path:
         """Return the path of the file that stores the result.
 
-        cache_dir: folder of the cache; None for the cache of the user.
+        cache_dir: folder of the cache; None means the cache of the user.
         """
         return (
             cache_dir or default_cache_dir()
@@ -72,7 +72,7 @@ class Specification(Generic[T]):
     def checkpoints(self, cache_dir: Path | None) -> CheckpointStore:
         """Return the store for checkpoints of the computation of this result.
 
-        cache_dir: folder of the cache; None for the cache of the user.
+        cache_dir: folder of the cache; None means the cache of the user.
         """
         return CheckpointStore(self.path(cache_dir).with_suffix(".parts"))
 
@@ -216,7 +216,7 @@ class EtaEstimator:
         """Return the progress as text, such as "40 %, about 3 min left".
 
         done, total: numbers of steps.
-        now_s: current time.
+        now_s: current time, s.
 
         If `total` changes or `done` decreases, a new estimate starts.
         """

@@ -35,9 +35,9 @@ class Repeats:
 class RepeatLimiter:
     """A structlog processor that passes only the 1st, 10th, 100th, ... of equal log records.
 
-    In addition, a repeated record passes once in REPORT_PERIOD_S. Records that differ only in
-    numbers count as equal. Repeated records that pass contain the number of occurrences since the
-    start of the node as `count`.
+    In addition, one repeated record passes every REPORT_PERIOD_S seconds. Records that differ only
+    in numbers count as equal. Repeated records that pass contain the number of occurrences since
+    the start of the node as `count`.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:

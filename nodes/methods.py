@@ -76,8 +76,8 @@ class Trial:
     in_scene: whether the scene's working range includes the case.
     size: size of the solved problem, such as {"skin_nodes": 1210}.
     extra_metrics: function from the result of `run` to further results, with units in their names.
-    reference_uncertainty: uncertainty of the reference, by the name of the result ("error" or an
-        extra metric).
+    reference_uncertainty: uncertainties of the reference. The keys are "error" and the names of
+        extra metrics.
     """
 
     method: str
@@ -103,7 +103,7 @@ class Family:
         must be run before the next trial is requested.
     tolerance: function that returns the scene's tolerance for the error, in `unit`.
     sweep_key: key of a property of the cases. A separate plot shows the errors against this
-        property. None: there is no such plot.
+        property. If None, there is no such plot.
     prepare: function that computes and caches the data for `trials`, and reports its progress.
     """
 

@@ -137,7 +137,7 @@ class Input(Generic[M]):
 
     All timestamps are converted to this host's clock.
 
-    clock_problem: reason why the conversion is not reliable, or "".
+    clock_problem: reason why the conversion is not reliable, or "" if it is.
     has_ended: whether the connection to the writer has ended since the last message; updated only
         for the `watched_inputs` of a node.
     """
@@ -186,8 +186,8 @@ class Output(Generic[M]):
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
         """Publish a message, and return its header.
 
-        source_ns: time of the measurement from which the message was computed; None for the current
-            time.
+        source_ns: time of the measurement from which the message was computed; None means the
+            current time.
         """
         now_ns = self._clock.now_ns()
         header = Header(
@@ -370,11 +370,11 @@ class Node:
         """Connect the ports to topics.
 
         send: function that sends messages.
-        topics: topic names by port, for ports whose name differs from that of the topic, such as
+        topics: topic names by port, for ports whose name differs from the topic's name, such as
             {"arm": "arm_left"}.
-        epoch: number that identifies one start of the node; None for the time (ns) of the start.
+        epoch: number that identifies one start of the node; None means the time (ns) of the start.
 
-        Raises TypeError if the message type of a topic differs from that of its port.
+        Raises TypeError if the message types of a port and of its topic differ.
         """
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash
@@ -482,7 +482,7 @@ class Node:
         """Store a message in its input, call its handler, and wait until it is finished.
 
         header: header with timestamps of this host's clock.
-        clock_problem: reason why the timestamps are not reliable, or "".
+        clock_problem: reason why the timestamps are not reliable, or "" if they are.
         """
         self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)

@@ -60,9 +60,10 @@ class PortConfig(BaseModel):
 class NodeConfig(BaseModel):
     """The configuration of one node.
 
-    keys_file: file with the encryption keys (a `KeyRing`); None for no encryption.
+    keys_file: file with the encryption keys (a `KeyRing`); None if there is no encryption.
     estop_resetters: writers that may reset an e-stop or enable the arms; None if all writers may.
-    clocks: connection to the topic with the clock offsets of other hosts; None for a single host.
+    clocks: connection to the topic with the clock offsets of other hosts; None if there is only one
+        host.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -1,8 +1,8 @@
 """Compute the kinematics of 6-axis arms with a spherical wrist in closed form.
 
-At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z. Joint angles are (6,) in
-radians, poses are 4x4 `base_from_flange` in metres. A branch is one of up to eight solutions of a
-pose for the joint angles. `ClosedFormArm` in the scene defines the dimensions.
+At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z. Joint angles are arrays
+(6,), in radians. Poses are 4x4 matrices `base_from_flange`, in metres. A branch is one of up to
+eight solutions of a pose for the joint angles. `ClosedFormArm` in the scene defines the dimensions.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from flexsheet.nodes.arm_bridge.joint_chain import SerialChain, UnreachableError
 from flexsheet.nodes.arrays import Floats
 
 WRIST_SINGULAR = 1e-7
-"""The value of |sin J5| below which the axes of J4 and J6 are parallel, and J4 is fixed."""
+"""The value of |sin J5| below which the axes of J4 and J6 count as parallel. J4 then stays fixed.
+"""
 
 SHOULDER_SINGULAR_M = 1e-7
-"""The distance of the wrist centre from the axis of J1 below which J1 is fixed."""
+"""The distance of the wrist centre from the axis of J1 below which J1 stays fixed."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
 """The values of |J5| that bound the region of the wrist singularity. Below the first value, J4 may
@@ -71,7 +72,8 @@ BRANCHES = tuple(
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
     """Return the rotation matrix (3, 3) of the forearm.
 
-    joint_1: angle of J1 about z, rad. joints_23: sum of the angles J2 and J3 about y, rad.
+    joint_1: angle of J1 about z, rad.
+    joints_23: sum of the angles J2 and J3 about y, rad.
     """
     c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
     return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
@@ -81,6 +83,7 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
     """Return the angle (rad) by which an axis rotates to become parallel to a vector.
 
     Near a singularity, the vector is short, and the axis may deviate from the vector.
+
     along, across: components of the vector parallel and perpendicular to the axis.
     fixed, near: lengths of the vector at which the permitted deviation is 90 degrees and zero. The
         deviation is reduced by at most MAX_FREE_ROTATION_RAD per step.
@@ -100,7 +103,8 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
 def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
     """Return the angle of J6 (rad) for which J4, J5 and J6 best approximate a rotation.
 
-    wrist: rotation matrix (3, 3) from the forearm to the flange. q4, q5: angles of J4 and J5, rad.
+    wrist: rotation matrix (3, 3) from the forearm to the flange.
+    q4, q5: angles of J4 and J5, rad.
     """
     s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
     first = (c4 * c5, s4 * c5, -s5)
@@ -198,6 +202,7 @@ class ClosedFormKinematics:
         """Return all solutions (rad) of the inverse kinematics for a flange pose (4, 4).
 
         present_rad: present joint angles (6,), which replace undefined angles at a singularity.
+
         The solutions are in the order of `BRANCHES`, and may exceed the joint ranges. The list is
         empty if the wrist centre is out of reach.
         """
@@ -304,6 +309,7 @@ class ClosedFormKinematics:
         """Return the angle (0 to pi rad) between the upper arm and the line from elbow to wrist.
 
         out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder.
+
         Returns None if the wrist centre is out of reach.
         """
         cosine = (out * out + height * height - self._upper_m**2 - self._elbow_to_wrist_m**2) / (
@@ -314,7 +320,7 @@ class ClosedFormKinematics:
         return acos(min(1.0, max(-1.0, cosine)))
 
     def _solve_shoulder(self, out: float, height: float, q3: float) -> float:
-        """Return the angle of J2 (rad) that places the wrist centre.
+        """Return the angle of J2 (rad) that moves the wrist centre to the given position.
 
         out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder.
         q3: angle of J3, rad.
@@ -376,7 +382,9 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        near_rad: joint angles (6,) that select among angles that differ by whole revolutions.
+        near_rad: joint angles (6,). Of angles that differ by whole revolutions, the nearest to
+            these is returned.
+
         Angles may exceed the joint ranges. Angles are NaN for poses out of reach.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)

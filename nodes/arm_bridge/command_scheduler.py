@@ -9,8 +9,10 @@ from dataclasses import dataclass
 class CommandScheduler:
     """A scheduler for the commands to one arm.
 
-    period_s: time between periodic commands. target_period_s: time between targets.
+    period_s: time between periodic commands.
+    target_period_s: time between targets.
     idle_period_s: time between commands to an idle arm.
+
     In all methods, `sent_ns` is the time of the last command, or 0 before the first command.
     """
 
@@ -35,6 +37,7 @@ class CommandScheduler:
         """Return whether a periodic command must be sent now.
 
         target_ns: arrival time of the newest target.
+
         No periodic command is sent shortly before the next target is due, because the arm would
         still be busy when the target arrives.
         """

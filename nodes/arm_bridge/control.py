@@ -91,7 +91,7 @@ MAX_JOINT_JUMP_RAD = 0.35
 solution of the inverse kinematics."""
 
 RELAX_DELAY_S = 0.5
-"""The time without a target or a permission to move after which the arms slacken the sheet."""
+"""The time after which the arms slacken the sheet if they have no target or must not move."""
 
 STALE_REASONS = {
     Freshness.STALLED: "the counters of its status stand still, so its joint angles are not used",
@@ -133,7 +133,8 @@ class Timeouts:
 class Command:
     """A command for the arm's controller.
 
-    mode: `move`, `hold`, `stop` or `idle`. joints_rad: joint angles (6,) for the mode `move`.
+    mode: `move`, `hold`, `stop` or `idle`.
+    joints_rad: joint angles (6,) for the mode `move`.
     """
 
     mode: str
@@ -239,9 +240,10 @@ class ArmControl:
         self._state = target
 
     def on_answer_missed(self, text: str) -> bool:
-        """Record a command without an answer; return False if the previous answer is missing too.
+        """Record that a command was not answered; return False if the previous one was not either.
 
         text: reason that is shown to the operator.
+
         After the first missing answer, the motion continues from the unanswered command.
         """
         if self._missed or self.measured_rad is None:
@@ -257,7 +259,8 @@ class ArmControl:
     def on_exchange_failed(self, text: str, *, silent: bool) -> bool:
         """Record a failed exchange; return True if the connection to the arm has just been lost.
 
-        text: reason that is shown to the operator. silent: whether the arm has not answered.
+        text: reason that is shown to the operator.
+        silent: whether the arm has not answered.
         """
         if silent and self.last_measured_rad is None:
             # The arm has never answered, so it may still be starting, which is no fault.
@@ -321,10 +324,11 @@ class ArmControl:
     def on_estop(
         self, estop: EStop, stamp_ns: int, now_ns: int, clock_problem: str = ""
     ) -> str | None:
-        """Engage or reset the e-stop; return the reason if a reset is refused, otherwise None.
+        """Engage or reset the e-stop; return the reason if a reset is refused, or None if not.
 
         stamp_ns: timestamp of the message.
         clock_problem: reason why the timestamp is uncertain; empty if the timestamp is certain.
+
         Messages of several nodes may arrive in any order. A reset is therefore refused if its
         timestamp is before the last stop or in the future.
         """
@@ -355,7 +359,7 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm; return the reason if the command is refused, otherwise None.
+        """Arm or disarm the arm; return the reason if the command is refused, or None if not.
 
         age_s: age of the operator's command.
         """
@@ -390,7 +394,10 @@ class ArmControl:
     def _check_interlocks(
         self, goal: Goal | None, other: OtherArm | None, clock_problem: str
     ) -> None:
-        """Disarm the arm if an interlock forbids motion; otherwise arm it with automatic arming."""
+        """Disarm the arm if an interlock forbids motion.
+
+        Otherwise, arm the arm if `auto_arming` is true.
+        """
         silent = other is None or not other.age_s <= self._timeouts.stop_after_s
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
         reason = self._find_interlock(goal, None if silent else other)
@@ -411,7 +418,7 @@ class ArmControl:
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return the reason why motion is forbidden, or None.
+        """Return the reason why motion is forbidden, or None if motion is permitted.
 
         other: state of the other arm; None if the other arm's messages are late.
         """
@@ -484,7 +491,7 @@ class ArmControl:
         return self._move_to_target(goal, other, measured)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
-        """Return the reason if the arm must stop without slackening the sheet, otherwise None."""
+        """Return the reason if the arm must stop without slackening the sheet, or None if not."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if other is not None and other.estopped:
@@ -492,7 +499,10 @@ class ArmControl:
         return clock_problem if clock_problem and not self.faults else None
 
     def _wait_for_arming(self, other: OtherArm) -> Command:
-        """Return the command while an arm is not armed: stop, and then slacken the sheet."""
+        """Return the command while an arm is not armed.
+
+        The command stops the arm, and then slackens the sheet.
+        """
         self._waited_s += self._step_s
         if self.ready:
             return self._wait_for_other()
@@ -507,7 +517,7 @@ class ArmControl:
     def _wait_for_other(self) -> Command:
         """Return the command that stops this arm because the other arm is not armed.
 
-        With manual arming, this arm is disarmed if it has moved or has waited too long.
+        If arming is manual, this arm is disarmed when it has moved or has waited too long.
         """
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest
@@ -646,6 +656,7 @@ class ArmControl:
         """Return the sheet's motion after one step towards the target.
 
         speed_factor: factor for the speed bounds; below 1 if this arm is ahead of the other arm.
+
         After a start, the sheet moves slowly until the sheet has reached the target.
         """
         if not self._settled:
@@ -826,7 +837,9 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured))
 
     def _restart_refusal(self, measured: Floats) -> str | None:
-        """Return the reason why a motion must not start from the measured angles (6,) rad, or None.
+        """Return the reason why no motion may start at the measured angles (6,) rad, or None.
+
+        None means that a motion may start.
 
         Away from the last commanded position, a motion may start only if the measurements are
         plausible. If the measured angles were wrong, the arm would jump.

@@ -29,7 +29,7 @@ RANGE_MARGIN_RAD = np.radians(2.0)
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
 """The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
-Servos ripple and measurements are noisy."""
+The margins are necessary because servos ripple and measurements are noisy."""
 
 EDGE_SPEED_FRACTION = 0.95
 """The fraction of the maximum tool speed that the sheet's edges may use."""
@@ -116,7 +116,7 @@ class ArmGeometry:
         return pose
 
     def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
-        """Return an upper bound (m) of the edge's motion between two joint vectors (6,) rad."""
+        """Return an upper bound (m) of the edge's motion between two joint positions (6,) rad."""
         return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
@@ -138,6 +138,7 @@ class ArmGeometry:
         """Return the joint angles (6,) rad that move this arm's edge to a pose of the sheet.
 
         present_rad: present joint angles (6,), which must be near the result.
+
         The deflection of the arm by the sheet's tension is compensated. Raises UnreachableError if
         the arm cannot reach the pose.
         """
@@ -159,6 +160,7 @@ class ArmGeometry:
         """Return the encoder angles (6,) rad that place the flange at a world pose (4, 4).
 
         near_rad: joint angles (6,) near the result.
+
         The arm is assumed to be rigid. Raises UnreachableError if the arm cannot reach the pose.
         """
         offsets_rad = self._joint_offsets_rad
@@ -188,8 +190,8 @@ class ArmGeometry:
     def measure_sheet(self, joints_rad: Floats, world_from_other_flange: Floats) -> SheetMotion:
         """Return the pose and stretch of a sheet at rest between both arms.
 
-        joints_rad: measured joint angles (6,) of this arm. world_from_other_flange: measured pose
-            (4, 4) of the other arm's flange.
+        joints_rad: measured joint angles (6,) of this arm.
+        world_from_other_flange: measured pose (4, 4) of the other arm's flange.
         """
         other_edge = world_from_other_flange @ self.other_flange_from_edge
         return self.sheet_between(self.world_from_edge(joints_rad), other_edge)
@@ -197,9 +199,10 @@ class ArmGeometry:
     def check_limits(
         self, flange: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
     ) -> str | None:
-        """Return a description of the limit that the flanges or the sheet violate, or None.
+        """Describe the limit that the flanges or the sheet violate; return None if there is none.
 
-        flange, other_flange: world poses (4, 4). slack_m: tolerance on the limits of the flange.
+        flange, other_flange: world poses (4, 4).
+        slack_m: tolerance on the limits of the flange.
         """
         return check_flange(flange, other_flange, limits, slack_m=slack_m) or check_sheet(
             flange @ self.flange_from_edge,

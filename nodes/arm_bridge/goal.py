@@ -1,6 +1,6 @@
 """Convert a sheet target to the goal of the next command, and synchronize the two arms.
 
-Poses are 4x4 in the world frame.
+Poses are 4x4 matrices in the world frame.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MAX_PREDICTION_S = 0.15
 margin."""
 
 MAX_TRAJECTORY_S = 0.4
-"""The maximum duration of a trajectory, during which an arm moves without a new message."""
+"""The maximum duration of a trajectory, on which an arm moves even if no new message arrives."""
 
 SKEW_LENGTH_M = 0.25
 """The offset between two sheet poses that counts as much as a rotation of 1 rad."""
@@ -188,6 +188,9 @@ def _sheet_centre(edge: Floats, along_m: float) -> Floats:
 
 
 def _difference(pose: Floats, other: Floats) -> Floats:
-    """Return the rotation vector (rad) and the offset divided by SKEW_LENGTH_M as a vector (6,)."""
+    """Return the difference of two poses as a vector (6,).
+
+    The elements are the rotation vector (rad), and the offset divided by SKEW_LENGTH_M.
+    """
     rotation = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
     return np.concatenate([rotation, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

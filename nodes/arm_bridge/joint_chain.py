@@ -1,8 +1,8 @@
 """Compute the kinematics of any arm with six rotary joints numerically.
 
-Joint angles are (6,) or (n, 6) in radians, poses are 4x4 `base_from_flange` in metres. The inverse
-kinematics use a damped Newton method, which starts at known joint angles. A distant pose is solved
-through intermediate poses, so the arm does not switch to another solution.
+Joint angles are arrays (6,) or (n, 6), in radians. Poses are 4x4 matrices `base_from_flange`, in
+metres. The inverse kinematics use a damped Newton method, which starts at known joint angles. A
+distant pose is solved through intermediate poses, so the arm does not switch to another solution.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ SEEDS = 256
 SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
-"""The minimum of |sin(difference / 2)| for at least one joint of two distinct solutions."""
+"""The minimum of |sin(difference / 2)|, which two distinct solutions exceed in at least one joint.
+"""
 
 
 class UnreachableError(FlexsheetError, ValueError):
@@ -71,7 +72,7 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class SeedBranch(NamedTuple):
-    """A branch of an arm without closed-form kinematics, defined by one joint solution (6,) rad."""
+    """A branch of an arm whose kinematics have no closed form, defined by one joint solution."""
 
     seed_rad: tuple[float, ...]
 
@@ -268,7 +269,7 @@ class NumericKinematics:
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
-        """Return the branches that reach the first reachable one of the flange poses (n, 4, 4)."""
+        """Return the branches that reach the first reachable pose in the flange poses (n, 4, 4)."""
         for pose in base_from_flange:
             if found := self.solve_all(pose):
                 return [self.find_branch(joints) for joints in found]

@@ -3,7 +3,8 @@
 Joint speed, joint acceleration and tool speed are clamped. The tool speed is the maximum speed of
 the flange and of the clamped edge of the sheet. Limits of the sheet, of the distance between the
 flanges and of the workspace cannot be clamped. If such a limit is violated, a check returns a text,
-and the caller stops the arm. Joint angles are (6,) rad, poses 4x4 in metres.
+and the caller stops the arm. Joint angles are arrays (6,), in radians. Poses are 4x4 matrices, in
+metres.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ MAX_TRAVEL_STEP_S = 0.01
 commands, the arm would exceed the tool speed to catch up."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
-"""The minimum and the maximum duration of a command. With a shorter duration, rounding errors would
-dominate the computed speeds."""
+"""The minimum and the maximum duration of a command. If the duration were shorter, rounding errors
+would dominate the computed speeds."""
 
 LENGTH_TOLERANCE_M = 1e-7
 MIN_BLEND = 0.02
@@ -117,8 +118,9 @@ def limit_velocity(
 ) -> Floats:
     """Return joint velocities (6,) rad/s for the next step towards a moving goal.
 
-    velocity: result of the previous call. goal_rad: joint angles (6,) of the goal at the end of the
-        step. If they are not finite, the arm decelerates.
+    velocity: result of the previous call.
+    goal_rad: joint angles (6,) of the goal at the end of the step. If they are not finite, the arm
+        decelerates.
 
     For any goal, joints_rad + result * step_s is within the joint ranges, and joint and tool speeds
     are within their limits. If the tool would be too fast, the result is a blend of the desired and
@@ -190,7 +192,9 @@ def clamp_to_range(
 ) -> Floats:
     """Limit velocities (6,) rad/s so that the joints can stop within their ranges.
 
-    velocity: velocities of the previous step. The result respects the maximum acceleration.
+    velocity: velocities of the previous step.
+
+    The result respects the maximum acceleration.
     """
     max_acceleration = limits.acceleration_rad_per_s2
     up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
@@ -278,10 +282,11 @@ def measure_twist_rad(edge: Floats, other_edge: Floats) -> float:
 
 
 def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
-    """Return a description of the limit that the sheet violates, or None.
+    """Describe the limit that the sheet violates; return None if there is none.
 
     edge, other_edge: world poses (4, 4) of this arm's edge and of the other edge.
     left: whether this arm holds the left edge.
+
     Values that are not finite violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
@@ -311,9 +316,11 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return a description of the violated limit (workspace or flange distance), or None.
+    """Describe the violated limit (workspace or flange distance); return None if there is none.
 
-    flange_world, other_flange: world poses (4, 4). slack_m: tolerance on both limits.
+    flange_world, other_flange: world poses (4, 4).
+    slack_m: tolerance on both limits.
+
     Values that are not finite violate both limits.
     """
     position = flange_world[:3, 3]
@@ -334,7 +341,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return a description of a tracking error above the maximum, or None.
+    """Describe a tracking error above the maximum; return None if there is none.
 
     joints_rad, measured_rad: commanded and measured joint angles (6,).
     """

@@ -43,6 +43,7 @@ def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]
     """Decode the answer to a command; return the arm's status and its measurement counter.
 
     sequence: number of the command.
+
     Raises ArmAnswerError if the answer is invalid.
     """
     try:

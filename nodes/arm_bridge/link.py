@@ -52,7 +52,7 @@ class ArmRefusedError(ArmLinkError):
 
 
 class ArmAnswerError(ArmLinkError):
-    """An error for an answer that is damaged, of another protocol, or for another command."""
+    """An error for an answer that is damaged, of an unknown protocol, or to another command."""
 
     code = "arm-answer"
     remedy = (
@@ -101,7 +101,7 @@ class Freshness(StrEnum):
 
 
 class CounterMonitor:
-    """A detector of old or repeated measurements by the controller's 32-bit counters.
+    """A detector of old or repeated measurements, which compares the controller's 32-bit counters.
 
     max_unchanged_s: maximum time for which the counters may stay unchanged.
     """
@@ -195,7 +195,9 @@ class ConnectedLink(ABC):
 
     A driver implements `connected`, `_connect`, `_request` and `_disconnect`. The base class opens
     the connection, and closes the connection after a failure. The first reconnection is immediate.
-    Further attempts wait for MIN_PAUSE_S to MAX_PAUSE_S, with a doubled pause each time.
+    Before each further attempt, the driver waits for a pause. The first pause is MIN_PAUSE_S. Each
+    pause is twice as long as the previous one, up to MAX_PAUSE_S.
+
     connections: number of connections that were opened.
     """
 
@@ -226,7 +228,9 @@ class ConnectedLink(ABC):
     ) -> tuple[ArmStatus, tuple[int, ...]]:
         """Send one command, wait for its answer, and return the arm's status and counters.
 
-        mode, joints_rad: see `ArmLink`. now_ns: time of the command.
+        mode, joints_rad: see `ArmLink`.
+        now_ns: time of the command.
+
         The first counter is the number of the controller's joint measurements. Raises
         ArmSilentError, ArmRefusedError or ArmAnswerError.
         """
@@ -236,7 +240,7 @@ class ConnectedLink(ABC):
         """Close the connection if it is open."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether an exchange may be attempted now, or must wait after a failure."""
+        """Return whether an exchange may be attempted now; after a failure, a pause follows."""
         return self.connected or now_ns >= self._try_again_ns
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:

@@ -23,7 +23,7 @@ def make_link(
 ) -> ArmLink:
     """Create the link to an arm, without opening a connection.
 
-    timeout_s: maximum time to wait for an answer; None selects the driver's default.
+    timeout_s: maximum time to wait for an answer; None means the driver's default.
     with_currents: whether to request the motor currents, which only MXT controllers report.
     """
     options: dict[str, Any] = {} if timeout_s is None else {"timeout_s": timeout_s}

@@ -112,6 +112,7 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
     """Encode a command block as a list of 16-bit registers.
 
     joints_rad: joint angles (6,).
+
     Sequence number and time are encoded modulo 2^32.
     """
     body = struct.pack(
@@ -166,7 +167,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 class _Framer(FramerSocket):
     """A Modbus framer that fails the pending request if an answer cannot be decoded.
 
-    With the framer of pymodbus, the request would wait until its time-out.
+    If the driver used the framer of pymodbus, the request would wait until its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:

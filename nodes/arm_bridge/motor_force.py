@@ -94,7 +94,7 @@ class MotorForceEstimator:
         *,
         forward: Callable[[Floats], Floats],
     ) -> Force | None:
-        """Return the estimated force at `at_ns`; None if the last estimate is too recent.
+        """Return the estimated force at `at_ns`, or None if the last estimate is too recent.
 
         For the other arguments, see `estimate_pull_n`.
         """

@@ -79,7 +79,8 @@ _PACKET = struct.Struct("<" + "".join(f"{field.count}{field.kind}" for field in 
 class MxtStatus(ArmStatus):
     """The contents of an answer packet.
 
-    count: number of the controller's communications. timeouts: number of cycles without a command.
+    count: number of the controller's communications.
+    timeouts: number of cycles in which no command arrived.
     """
 
     count: int
@@ -151,9 +152,9 @@ def has_advanced(count: int, before: int, steps: int) -> bool:
 class MxtLink:
     """A driver for a controller that runs an `Mxt` program.
 
-    Late answers are detected by the controller's counter, which must advance by the number of
-    commands since the last answer. After a lost command, the next answer is therefore dropped too.
-    The mode `idle` restarts the comparison of the counter.
+    The controller's counter indicates late answers: it must advance by the number of commands since
+    the last answer. After a lost command, the next answer is therefore dropped too. The mode `idle`
+    restarts the comparison of the counter.
     stale: number of late answers that were dropped.
     """
 

@@ -258,7 +258,7 @@ class ArmBridge(Node):
     def _read_goal(self, trajectory: SheetTrajectory | None) -> Goal | None:
         """Return the goal at the time when the next command takes effect.
 
-        trajectory: trajectory of the target if the other arm follows it too, otherwise None.
+        trajectory: trajectory of the target, or None if the other arm does not follow it.
         """
         target = self.sheet_target.message
         if target is None:

@@ -14,7 +14,7 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import is_rigid
 
 MAX_FUTURE_S = 0.02
-"""The tolerance for timestamps in the future, because of clock errors."""
+"""The maximum time by which a timestamp may be in the future because of clock errors."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
 """The maximum time between the camera exposures of two targets with overlapping trajectories."""
@@ -57,8 +57,8 @@ class OtherArm:
     ) -> OtherArm:
         """Convert a state message of the other arm's bridge.
 
-        age_s: age of the message. target_source_ns: time of the camera exposure for this arm's
-            target.
+        age_s: age of the message.
+        target_source_ns: time of the camera exposure for this arm's target.
         """
         other_ns = state.target_source_ns
         ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)
@@ -100,7 +100,10 @@ class OtherArm:
 
     @property
     def interlock_reason(self) -> str | None:
-        """Return the reason why the other arm's state forbids motion of this arm, or None."""
+        """Return the reason why the other arm's state forbids motion of this arm.
+
+        None means that the state permits motion.
+        """
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

@@ -33,8 +33,8 @@ class ArmBridgeParameters(NodeParameters):
     )
     servo_lag_s: NonNegative = Field(
         default=0.03,
-        description="lag of the arm behind commands of constant velocity, s. With "
-        "measure_servo_lag, it is the initial value",
+        description="lag of the arm behind commands of constant velocity, s. If measure_servo_lag "
+        "is true, this is the initial value",
     )
     measure_servo_lag: bool = Field(
         default=True,

@@ -189,6 +189,7 @@ def _check_alignment(
     """Raise PathError if a straight joint motion of both arms violates a limit.
 
     begin, there: joint angles of both arms at the start and at the end.
+
     Limits that are already violated at the start are widened.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
@@ -228,7 +229,7 @@ def _find_duration_s(
 
 
 class PathChecker:
-    """A runner of path checks in a thread, one check at a time."""
+    """A runner that checks one path at a time in a separate thread."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other
@@ -237,9 +238,11 @@ class PathChecker:
     def poll(
         self, request: PathCheckRequest | None
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
-        """Return a finished request and its result, or None; call this method in every cycle.
+        """Return a finished request and its result, or None if no check has finished.
 
-        request: check to start unless a check is running; None if no check is necessary.
+        The caller must call this method in every cycle.
+
+        request: path whose check is started if no check is running; None if no check is necessary.
         """
         if self._running is None:
             if request is not None:

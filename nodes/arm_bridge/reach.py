@@ -1,9 +1,9 @@
 """Check whether the arms can reach many poses of the sheet, or follow a path.
 
-Two arms hold the sheet by its left and right edges. Poses of the sheet are (n, 4, 4) in the world
-with stretch ratios (n,). Joint angles are (n, 6) rad. A margin is the distance to a limit, positive
-within the limit. Margins of speeds are fractions of the limit. A branch is one of the discrete
-solutions of the inverse kinematics.
+Two arms hold the sheet by its left and right edges. An array of n poses of the sheet consists of
+world poses (n, 4, 4) and stretch ratios (n,). Joint angles are (n, 6) rad. A margin is the distance
+to a limit, positive within the limit. Margins of speeds are fractions of the limit. A branch is one
+of the discrete solutions of the inverse kinematics.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class SheetPoses:
-    """Poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
+    """World poses (n, 4, 4) of the sheet, with a stretch ratio (n,) and k twists (n, k, 6) each.
 
     twists_world: velocities (m/s, rad/s) of the sheet's centre that the arms must be able to follow
         at each pose; k may be 0.
@@ -183,8 +183,8 @@ def _margins(
 ) -> dict[str, Floats]:
     """Return the margins (n,) of all limits for n poses of the sheet.
 
-    joints: joint angles (n, 6) rad. flanges, others: world poses (n, 4, 4) of this arm's flange and
-        of the other arm's flange.
+    joints: joint angles (n, 6) rad.
+    flanges, others: world poses (n, 4, 4) of this arm's flange and of the other arm's flange.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     without = np.full(len(joints), np.inf)
@@ -255,7 +255,8 @@ class PathStep:
 class PathError(FlexsheetError, ValueError):
     """An error for a path that the arms cannot follow.
 
-    limit: a member of `LIMITS`, "jump" or "alignment". fraction: position on the path, 0 to 1.
+    limit: a member of `LIMITS`, "jump" or "alignment".
+    fraction: position on the path, 0 to 1.
     """
 
     code = "path"
@@ -284,7 +285,8 @@ def plan_path(
 ) -> list[PathStep]:
     """Plan a path for both arms that is straight between the given corners.
 
-    left_rad, right_rad: joint angles (6,) near those at the first corner.
+    left_rad, right_rad: joint angles (6,) near the solution for the first corner.
+
     Between two corners, the sheet rotates about one axis and its stretch changes linearly. Raises
     PathError if the path violates a limit.
     """
@@ -374,6 +376,7 @@ def solve_step(
 
     near: neighbouring step on the path, with joint angles near the solution.
     fraction: position on the path (0 to 1) for the error text.
+
     Raises PathError if a limit of COMMAND_LIMITS is violated.
     """
     step = _solve_both(left, right, sheet, near, fraction=fraction)

@@ -21,7 +21,7 @@ class LastExchange:
     """The times (ns on this computer's clock) of the newest exchange with the arm.
 
     target, received_ns: header and arrival time of the sheet target.
-    trajectory_ends_ns: end of the target's trajectory; 0 without a trajectory.
+    trajectory_ends_ns: end of the target's trajectory; 0 if there is no trajectory.
     sent_ns, measured_ns: times of the last command and of the last answer; 0 before the first
         exchange.
     duration_s: duration of the last exchange.
@@ -49,7 +49,8 @@ class LatencyMean:
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
         """Add an exchange with a new target, and ignore exchanges with the same target.
 
-        Returns the mean latency (s) after every REPORTED_TARGETS targets, otherwise None.
+        Returns the mean latency (s) after every REPORTED_TARGETS targets. In between, the result is
+        None.
         """
         target, before = exchange.target, self._target
         self._target = target

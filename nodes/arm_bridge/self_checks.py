@@ -13,9 +13,9 @@ LAG_THRESHOLD_S = 0.01
 of a calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""The maximum difference between the tracking error and that of an ideal servo with the measured
-lag. At 0.4 m, it corresponds to 2 mm, which is four times the effect of the largest tabulated
-backlash (0.6 mrad per joint)."""
+"""The maximum difference between the measured tracking error and the tracking error of an ideal
+servo that has the measured lag. At a distance of 0.4 m from a joint, the difference corresponds to
+2 mm. The largest tabulated backlash (0.6 mrad per joint) has a quarter of this effect."""
 
 
 class ServoCheck:

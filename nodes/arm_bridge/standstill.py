@@ -8,12 +8,12 @@ from flexsheet.nodes.arm_bridge.link import Freshness
 from flexsheet.nodes.arrays import Floats
 
 STANDSTILL_COUNT = 5
-"""The number of consecutive unchanged measurements after which an arm at its last command is at
-rest."""
+"""The number of consecutive unchanged measurements after which an arm is at rest if it has reached
+its last command."""
 
 SETTLED_COUNT = 100
-"""The number of consecutive unchanged measurements after which an arm away from its last command is
-at rest. The number is sufficient for measurements that lag by 0.7 s."""
+"""The number of consecutive unchanged measurements after which an arm is at rest if it has not
+reached its last command. The number is sufficient for measurements that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
 """The maximum difference between measurements that count as unchanged: 200 times the encoder
@@ -27,7 +27,8 @@ JUMP_MARGIN_RAD = 0.002
 """The tolerance of the plausible joint motion between two measurements."""
 
 JUMP_SPEED_RAD_PER_S = 0.5
-"""The plausible joint speed without a command. The operator may move the arm by teach pendant."""
+"""The maximum plausible joint speed of an arm that is not commanded to move. The operator may move
+the arm with the teach pendant."""
 
 OVERSPEED = 1.5
 """The maximum ratio of an arm's speed to its commanded speed while the arm catches up."""

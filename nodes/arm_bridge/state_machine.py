@@ -95,7 +95,8 @@ MODES: Mapping[State, ArmMode] = {
     S.STOPPING_TAUT: "stopping",
     S.RELAX: "relax",
 }
-"""The published mode of each state. Exception: the mode is `fault` in TAUT with a latched fault."""
+"""The published mode of each state. Exception: in the state TAUT, the mode is `fault` if a fault is
+latched."""
 
 Row = dict[tuple[State, Event], State | None]
 
@@ -103,8 +104,8 @@ Row = dict[tuple[State, Event], State | None]
 def _row(event: Event, to: Mapping[State, State], *ignored_in: Iterable[State]) -> Row:
     """Return the transitions of one event; raise ValueError if a state occurs twice.
 
-    to: mapping from each state to the next state. ignored_in: groups of states that ignore the
-        event.
+    to: mapping from each state to the next state.
+    ignored_in: groups of states that ignore the event.
     """
     ignored = [state for group in ignored_in for state in group]
     row: Row = {(state, event): None for state in ignored} | {

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from flexsheet.nodes.camera.image_pair import DeviceError, Image
 
 GRAB_S = 1.0
-"""The maximum time (s) to wait for a frame, so that the reading thread can end without one."""
+"""The maximum time (s) to wait for a frame, so that the thread can end if no frame arrives."""
 
 BUFFERS = 4
 

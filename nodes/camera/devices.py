@@ -32,7 +32,7 @@ def open_reader(
 
     camera: camera of the scene.
     now: function that returns the current time (ns).
-    requested: sensor regions that the camera must deliver; None for the full sensors.
+    requested: sensor regions that the camera must deliver; None means the full sensors.
 
     Raises DeviceError if the source cannot be opened.
     """
@@ -54,7 +54,7 @@ class ReaderThread(threading.Thread):
     report(text): called for every device after it is opened, with its format and settings.
     warn(text): called for every setting that a device does not accept.
     finish(pairs): called at the end of the source, with the number of image pairs.
-    regions: sensor regions to deliver; None for the full images.
+    regions: sensor regions to deliver; None means the full images.
 
     All functions are called in the thread itself.
     """

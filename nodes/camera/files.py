@@ -35,7 +35,7 @@ class FileFrame:
 class VideoFile:
     """A video file that is read frame by frame.
 
-    rate_hz: frame rate; None: the frame times in the file are used.
+    rate_hz: frame rate. If None, the frame times in the file are used.
 
     Raises DeviceError if the file cannot be opened.
     """

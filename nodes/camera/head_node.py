@@ -137,7 +137,7 @@ class HeadCamera(Node):
         """Publish the eye positions in one image.
 
         at_ns: time of the exposure.
-        pixels: positions (2, 2) of both eyes, px; None without a face.
+        pixels: positions (2, 2) of both eyes, px; None if the image shows no face.
         """
         scene, last_ns = self.current_scene, self._published_ns
         if scene is None or (last_ns is not None and at_ns <= last_ns):
@@ -180,8 +180,8 @@ class HeadCamera(Node):
     async def watch(self) -> None:
         """Publish invalid eyes while no images arrive.
 
-        The timestamp is `silence_s` in the past, and therefore older than that of an image that is
-        still being searched.
+        The timestamp is `silence_s` in the past, and therefore older than the timestamp of an image
+        that is still being searched.
         """
         p = self.parameters
         at_ns = self.clock.now_ns() - round(1e9 * (p.delay_s + p.silence_s))
@@ -193,7 +193,7 @@ class FaceReader(threading.Thread):
     """A thread that searches the newest image of a camera for eyes.
 
     deliver(at_ns, pixels): called for each searched image, with the time of its exposure and the
-        pixel positions (2, 2) of the eyes, or None without a face.
+        pixel positions (2, 2) of the eyes. The positions are None if the image shows no face.
     fail(error): called for each DeviceError. The camera is then opened again after a delay.
 
     Both functions are called in the thread itself.

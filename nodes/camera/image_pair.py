@@ -57,11 +57,11 @@ Regions = tuple[Region, Region]
 class ImagePair:
     """A left and a right grey image (height, width) with nearly equal exposure times.
 
-    exposure_ns: mean of both mid-exposure times on the reader's clock; for files, the time since
-        the start of the file.
+    exposure_ns: mean of both mid-exposure times on the reader's clock. If the source is a file, the
+        clock starts at the start of the file.
     exposure_s: duration of the exposure that the device reports; None if unknown.
-    skew_s: mid-exposure time of the right image minus that of the left image.
-    regions: sensor regions of the images; None for full sensors.
+    skew_s: mid-exposure time of the right image minus mid-exposure time of the left image.
+    regions: sensor regions of the images; None means full sensors.
     notes: remarks for the operator.
     """
 
@@ -79,9 +79,10 @@ class Reader(Protocol):
 
     paced: whether `read` returns immediately, as for files. In that case, the caller must wait
         until each image pair is due.
-    rate_hz: frame rate of a device, to count lost frames; None for files.
+    rate_hz: frame rate of a device, to count lost frames; None if the source is a file.
     warnings: texts about settings that the device did not accept.
-    opened: texts about the actual format and settings of each device; empty for files.
+    opened: texts about the actual format and settings of each device; empty if the source is a
+        file.
     """
 
     paced: bool
@@ -148,7 +149,7 @@ def describe_skew(skew_s: float, limit_s: float) -> str:
     """Return the reason for the rejection of an image pair, as text.
 
     skew_s: time between the left and the right exposure.
-    limit_s: maximum of this time.
+    limit_s: maximum permitted time.
     """
     return (
         f"{1e3 * skew_s:.1f} ms between left and right exposure, maximum {1e3 * limit_s:g} ms; "
@@ -204,7 +205,10 @@ def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
 
 
 def crop(images: ImagePair, regions: Regions) -> ImagePair:
-    """Crop images to sensor regions. Raises DeviceError if an image lacks a part of its region."""
+    """Crop images to sensor regions.
+
+    Raises DeviceError if an image does not contain its whole region.
+    """
     if images.regions == regions:
         return images
     parts = []

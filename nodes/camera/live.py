@@ -47,7 +47,7 @@ class CapturedFrame:
     """An image of one camera with two estimates of the mid-exposure time.
 
     by_arrival_ns: estimate that is based on the time of arrival.
-    by_stamp_ns: estimate that is based on the driver's timestamp; None without a timestamp.
+    by_stamp_ns: estimate that is based on the driver's timestamp; None if there is no timestamp.
     """
 
     image: Image
@@ -81,7 +81,7 @@ class Stream(threading.Thread):
     """A thread that reads the frames of one camera.
 
     views: 2 if each image contains both views side by side, otherwise 1.
-    requested: region of the sensor to read; None for the full sensor.
+    requested: region of the sensor to read; None means the full sensor.
     changed: condition that is notified after each frame and after a failure.
 
     The thread also releases the device, because OpenCV crashes if another thread releases the

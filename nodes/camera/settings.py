@@ -39,7 +39,8 @@ class Backend:
     buffers: number of frame buffers to request from the driver.
     stamp_fraction: time from the middle of the exposure to the driver's timestamp, as a fraction of
         the exposure time.
-    clock: whether CAP_PROP_POS_MSEC after a grab is the driver's timestamp of that frame.
+    clock: whether the value of CAP_PROP_POS_MSEC after a grab is the driver's timestamp of the
+        frame.
     """
 
     exposure_unit_s: float
@@ -99,7 +100,7 @@ class DeviceSettings:
 def choose_backend(device: int | str, api: str | None) -> Backend | None:
     """Choose the OpenCV backend for a device.
 
-    api: name of a backend, or None to choose the backend by the device.
+    api: name of a backend; None to choose a backend that fits the device.
 
     Returns None if OpenCV must choose the backend. The units of the camera's controls are then
     unknown.

@@ -13,7 +13,7 @@ from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class CameraSource(LimitedModel):
-    """A base class of the values of the camera node's parameter `source`."""
+    """The base class for values of the camera node's parameter `source`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

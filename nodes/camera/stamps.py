@@ -13,12 +13,11 @@ MAX_FUTURE_NS = 1_000_000
 rounding."""
 MAX_AGE_NS = 1_000_000_000
 """The maximum age (ns) of a timestamp when the frame arrives. Drivers with several frame buffers
-need this time at 10 Hz.
-"""
+need this time at 10 Hz."""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
-"""The tolerance for the pairing of frames, as a fraction of the frame period. Without a tolerance,
-jitter would drop frames of cameras that expose half a period apart."""
+"""The tolerance for the pairing of frames, as a fraction of the frame period. If there were no
+tolerance, jitter would drop frames of cameras that expose half a period apart."""
 
 
 class StampCheck:
@@ -51,10 +50,11 @@ class StampCheck:
 
 
 class Pairing:
-    """A matcher of the frames of two cameras with equal frame rates by exposure time.
+    """A matcher that pairs the frames of two cameras by their exposure times.
 
-    The cameras have no common trigger. Two frames are a pair if the time between their exposures is
-    at most half a period, plus a tolerance. Otherwise the older frame is dropped.
+    The cameras have equal frame rates, but no common trigger. Two frames are a pair if the time
+    between their exposures is at most half a period, plus a tolerance. Otherwise the older frame is
+    dropped.
 
     unpaired: number of dropped frames.
     """

@@ -27,7 +27,7 @@ class GaugeError(FlexsheetError, OSError):
 class SerialGauge:
     """A gauge at a serial port that sends one measurement per line, such as "+0.123 N".
 
-    unreadable: number of received lines without a finite number.
+    unreadable: number of received lines that contain no finite number.
     """
 
     def __init__(self, port: str, baud: int) -> None:

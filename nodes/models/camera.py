@@ -1,8 +1,8 @@
 """Project and undistort points with a pinhole camera and Brown's distortion.
 
-The camera frame has x to the right, y down and z along the optical axis. Points have the shape
-(..., 3), m. Pixels have the shape (..., 2), and their origin is the centre of the top left pixel,
-as in OpenCV.
+In the camera frame, the x axis points to the right, the y axis down, and the z axis along the
+optical axis. Points have the shape (..., 3), in m. Pixel coordinates have the shape (..., 2). As in
+OpenCV, their origin is the centre of the top left pixel.
 """
 
 from __future__ import annotations

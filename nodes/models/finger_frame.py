@@ -17,7 +17,8 @@ def world_from_finger(
 ) -> Floats:
     """Return the rotation matrix (3, 3) from a finger's frame to the world frame.
 
-    direction_world: vector (3,) from the fingertip to the hand. Without tilt, y is horizontal.
+    direction_world: vector (3,) from the fingertip to the hand. If the finger is not tilted, its y
+        axis is horizontal.
     tilt_rad: rotation (2,) of the finger about the world's x and y axes, as a rotation vector.
     """
     x = np.asarray(direction_world, dtype=np.float64)

@@ -49,8 +49,8 @@ SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
 are `DELAYS_S` and `BANDWIDTHS_RAD_PER_S`."""
 
 FILTER_DAMPING_RATIO = 0.5
-"""The damping ratio of the filter of the finger's depth. With a larger ratio, the control loop is
-unstable at smaller sheet offsets."""
+"""The damping ratio of the filter of the finger's depth. If the ratio were larger, the control loop
+would be unstable at smaller sheet offsets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[flo
     """Return the gains (alpha, beta) of the depth's filter for a step of `step_s`.
 
     The filter has the poles of a continuous filter with the damping ratio `FILTER_DAMPING_RATIO`.
-    With an infinite bandwidth, the filter returns the measured depth and its last change.
+    If the bandwidth is infinite, the filter returns the measured depth and its last change.
     """
     if math.isinf(bandwidth_rad_per_s):
         return 1.0, 1.0
@@ -115,11 +115,11 @@ def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[flo
 def make_loop_matrices(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the matrices (k, n, n) that map the state over one period, for slopes (k,).
+    """Return the matrices (k, n, n) that map the n states over one period, for slopes (k,).
 
-    The state contains depth and speed, the filter's estimates of both, and sheet offsets from
-    newest to oldest. These are all offsets that have not yet taken effect, and the last two that
-    have.
+    The states are the depth and its rate, the filter's estimates of both, and sheet offsets from
+    newest to oldest. The offsets are all that have not yet taken effect, and the last two that have
+    taken effect.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1
@@ -185,7 +185,7 @@ def compute_critical_slope(
 ) -> float:
     """Return the smallest slope magnitude at which the loop is unstable, at most `max_slope`.
 
-    towards_finger: whether the slopes are negative. With a negative slope, the sheet moves towards
+    towards_finger: whether the slopes are negative. If a slope is negative, the sheet moves towards
         the finger.
 
     The decay rate is interpolated between slopes on a grid. Larger slopes are not evaluated, even
@@ -276,7 +276,7 @@ class OffsetBoundsTable:
 
 
 def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
-    """Compute the maximum slopes at which all hands are stable with margins of gain and delay.
+    """Compute the maximum slopes at which all hands are stable, even if gain and delay are larger.
 
     advance_limit: upper limit of the slopes towards the finger.
 

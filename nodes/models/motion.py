@@ -52,7 +52,8 @@ def follow(
 
     error (n,): target at the end of the step minus the current point.
     velocity, target_velocity (n,): current velocities of the point and of the target.
-    max_acceleration: limit of the change of the mean velocity from one step to the next, per time.
+    max_acceleration: maximum change of the mean velocity from one step to the next, divided by
+        `step_s`.
     """
     target_velocity = _clamp_length(target_velocity, max_speed)
     desired = desired_velocity(
@@ -149,7 +150,7 @@ class EdgeBound:
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
         """Return the factor (0 to 1) by which both speeds of the sheet must be multiplied.
 
-        With this factor, no point of the edges exceeds the limit.
+        At the reduced speeds, no point of the edges exceeds the limit.
         """
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge

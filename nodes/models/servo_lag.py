@@ -55,7 +55,7 @@ targets."""
 
 HISTORY = 256
 MIN_COMMANDS = 4
-"""The minimum number of recorded commands for the use of a measurement."""
+"""The minimum number of recorded commands that is required to use a measurement."""
 
 MIN_STEP_S = 0.02
 """The minimum time between two measurements that are used, s.
@@ -112,7 +112,7 @@ class ServoLagEstimator:
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
-        """Create an estimator without data.
+        """Create an estimator that has no data yet.
 
         initial_s: initial lag, s; limited to the bounds.
         """

@@ -10,8 +10,8 @@ r(d) behind the tangent plane:
 The sheet retreats if the offset increases with the depth, and advances if the offset decreases. The
 sheet follows with a delay, so a retreat damps slow pushes, and an advance adds energy. The module
 `hand_loop` computes the largest slopes dr/dd at which the control loop with any hand is stable. The
-lowest stretch that renders the force without an advance is chosen. If there is none, the stretch
-with the smallest advance is chosen.
+lowest stretch that renders the force without an advance is chosen. If every stretch requires an
+advance, the stretch with the smallest advance is chosen.
 
 The sheet does not advance at forces that are too small to be felt. Otherwise the sheet would
 respond to the noise of the camera while a finger strokes the object.
@@ -65,12 +65,14 @@ TARGET_ERROR_RATIO = 0.10
 """The relative error of the rendered force above which the planner reports the error."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""The smallest relative differences of stiffness that users notice: with deformation of the skin
-(Bergmann Tiest & Kappers 2009), and without work and terminal force as cues (Tan et al. 1995)."""
+"""The smallest relative differences of stiffness that users notice. The first value applies if the
+skin deforms (Bergmann Tiest & Kappers 2009). The second applies if users can compare neither work
+nor final force (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""The maximum advance of the sheet towards the finger per depth of the push. With 0.5, the sheet
-feels 1.5 times as stiff. The bounds for a stable loop with the hand are usually lower."""
+"""The maximum advance of the sheet towards the finger per depth of the push. At this value, the
+sheet feels 1.5 times as stiff as without an advance. The bounds for a stable loop with the hand are
+usually lower."""
 
 SLOPE_TOLERANCE = 0.03
 """The tolerance of slopes with respect to their bounds, which contain larger safety margins."""
@@ -136,7 +138,7 @@ class StretchLimits:
     """The limits of the sheet's stretch, edge force and offset.
 
     edge_force_n: maximum force on each clamp.
-    bounds: bounds on the slope of the offset; None for an analysis without a hand.
+    bounds: bounds on the slope of the offset; None if the analysis does not include a hand.
     """
 
     min_stretch_ratio: float
@@ -163,8 +165,9 @@ def make_stretch_limits(
     """Return the limits of the stretch within the usable fraction of the scene's limits.
 
     bounds: bounds on the slope of the offset for a stable control loop of sheet and hand.
-    The stretch is limited by the edge force without contact. `render_force` limits the additional
-    edge force of a push.
+
+    The limit of the edge force refers to a sheet that nothing touches. `render_force` limits the
+    additional edge force of a push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -180,7 +183,7 @@ def make_stretch_limits(
 
 
 def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of a sheet without contact."""
+    """Return the force (N) on each clamp while nothing touches the sheet."""
     push = SheetPush(stretch_ratio, finger_radius_m=0.03 * model.rubber.width_m)
     return float(model.evaluate(push, np.zeros(1)).edge_force_n[0])
 
@@ -247,6 +250,7 @@ def render_force(
 
     push: stretch ratio, finger radius and position of the push.
     max_depth_m: maximum depth of the finger in the object.
+
     The edge force limits the indentation. The indentation increases by at most
     1 + `limits.max_advance` times the increase of the depth.
     """
@@ -281,7 +285,7 @@ def render_force(
 def _indentation_for_edge_force(
     model: SheetForceModel, edge_force_n: float, push: SheetPush, *, max_depth_m: float
 ) -> float:
-    """Return the indentation (m) at which the force on each clamp is `edge_force_n`, at least 0."""
+    """Return the indentation (m, at least 0) at which the force on each clamp is `edge_force_n`."""
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
     flat = _flat_edge_force_n(model, push.stretch_ratio)
     if flat >= edge_force_n:
@@ -296,7 +300,9 @@ def _indentation_for_edge_force(
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
     """Reduce the sheet's advance smoothly to zero at small depths and small contact forces.
 
-    depths, indentation: depths and indentations (n,), m. forces_n: contact forces (n,).
+    depths, indentation: depths and indentations (n,), m.
+    forces_n: contact forces (n,).
+
     Returns the changed indentations (n,), m.
     """
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
@@ -359,7 +365,8 @@ class Compliance:
     ) -> Floats:
         """Return the sheet's distances (n,), m, behind the object's tangent plane.
 
-        depths_m: depths (n,) of the finger in the object. Without contact, the distance is 0.
+        depths_m: depths (n,) of the finger in the object. If there is no contact, the distance is
+            0.
         position_m: (x, y) of the contact on the sheet.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
@@ -378,8 +385,8 @@ class Compliance:
         """Choose the bandwidth (rad/s) of the depth filter, and return whether the loop is stable.
 
         The result is the largest bandwidth at which the slopes of the offset are within their
-        bounds. If there is none, the smallest bandwidth is chosen. Without bounds, the bandwidth is
-        infinite.
+        bounds. If no bandwidth satisfies the bounds, the smallest bandwidth is chosen. If there are
+        no bounds, the bandwidth is infinite.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:
@@ -412,7 +419,11 @@ class Compliance:
 
 
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
-    """Return weights (n,) of nodes (n,) for interpolation linear in the squared coordinate."""
+    """Return the weights (n,) for an interpolation that is linear in the squared coordinate.
+
+    nodes: coordinates (n,) of the known values.
+    at: coordinate of the interpolated value.
+    """
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
     t = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
@@ -433,7 +444,7 @@ def fit_compliance(
     """Find the stretch ratio and the sheet offset that best render a force curve.
 
     stretch_ratio: fixed stretch ratio; None to choose the best stretch ratio.
-    max_depth_m: maximum depth of a push; None for the value of the scene.
+    max_depth_m: maximum depth of a push; None means the value of the scene.
     """
     depth_m = scene.working_range.push_depth_m if max_depth_m is None else max_depth_m
     radius_m, rubber = scene.finger.radius_m, model.rubber
@@ -498,7 +509,7 @@ def _find_best_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Return a warning about forces that the sheet cannot render, or an empty text.
+    """Return a warning about forces that the sheet cannot render, or "" if there are none.
 
     position_error_m: error of the sheet's position. The text also warns of objects so soft that
         this error changes the force noticeably.
@@ -547,7 +558,7 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, str]:
     """Return the stretch that renders an object's stiffness at small pushes without an offset.
 
-    The second result is a text about a stiffness that the sheet cannot render, or an empty text.
+    The second result is a text if the sheet cannot render the stiffness, otherwise it is empty.
 
     The sheet is modelled as linear, and the fingertip as a point.
     """

@@ -43,10 +43,10 @@ class ComplianceController:
         uses the minimum stretch.
     hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle; None to use
         the value in the scene.
-    bounds: bounds on the offset's slope for a stable control loop with the hand; None without a
-        hand.
+    bounds: bounds on the offset's slope for a stable control loop with the hand; None if no hand is
+        considered.
     delay_s: time from the measurement of a depth until the sheet has moved.
-    bandwidth_rad_per_s: bandwidth of the depth filter; None without bounds.
+    bandwidth_rad_per_s: bandwidth of the depth filter; None if there are no bounds.
     """
 
     def __init__(
@@ -102,7 +102,8 @@ class ComplianceController:
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
         """Set the delay from the measurement of a depth to the motion of the sheet.
 
-        Without contact, stretch and offset are fitted again if the delay changes the bounds.
+        If the new delay changes the bounds and there is no contact, stretch and offset are fitted
+        again.
         """
         self.delay_s = delay_s
         if self._bounds is None or in_contact:
@@ -145,7 +146,7 @@ class ComplianceController:
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 
     def _range_note(self, fitted: Compliance) -> str:
-        """Return why the force model is invalid for the deepest push, or an empty text."""
+        """Return why the force model is invalid for the deepest push, or "" if it is valid."""
         max_depth_m = self._scene.working_range.push_depth_m
         push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
         reason = self._model.invalid_reason(push, float(fitted.indentation_m(max_depth_m)))
@@ -158,8 +159,9 @@ class ComplianceController:
 
         depth_m: depth of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
-        A positive offset is behind the object's tangent plane. With hysteresis, the result also
-        depends on the depths of earlier calls.
+
+        A positive offset is behind the object's tangent plane. If the hysteresis is corrected, the
+        result also depends on the depths of earlier calls.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:

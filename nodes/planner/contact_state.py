@@ -99,6 +99,7 @@ class ContactStateMachine:
     """A state machine of the finger's contact with the object.
 
     home: axes (3, 3) of the sheet before the first contact; the third axis is the sheet's normal.
+
     Raises UnpresentableError if the tilt of the object's front exceeds the maximum.
     """
 
@@ -199,9 +200,10 @@ class ContactStateMachine:
     ) -> tuple[Nearest, Floats]:
         """Return the surface point to which the contact moves, and its velocity (3,) m/s.
 
-        found: surface point nearest to the finger. moved: displacement (3,) m of the finger since
-            the last step. velocity: velocity (3,) m/s of the finger. depth: depth (m) of the
-            finger.
+        found: surface point nearest to the finger.
+        moved: displacement (3,) m of the finger since the last step.
+        velocity: velocity (3,) m/s of the finger.
+        depth: depth (m) of the finger.
 
         At small depths, the contact is the surface point nearest to the finger. Deep inside the
         object, the contact moves as far as the finger moves along the sheet. Both motions are
@@ -227,7 +229,7 @@ class ContactStateMachine:
         """Roll the sheet on the object until the contact is at the surface point `found`.
 
         The contact stays within the usable area of the sheet. The second result is the violated
-        limit, or None.
+        limit, or None if no limit is violated.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])

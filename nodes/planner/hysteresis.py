@@ -1,9 +1,9 @@
 """Model the hysteresis of the sheet's rubber.
 
-The force is 1 + h times the elastic force while the finger moves inwards (loading), and 1 - h times
-the elastic force while the finger moves outwards. Here h = r / (2 - r), and r is the fraction of
-the loading energy that the rubber loses. After a reversal, the factor changes linearly with the
-finger's travel.
+While the finger moves inwards (loading), the force is 1 + h times the elastic force. While the
+finger moves outwards, the force is 1 - h times the elastic force. Here h = r / (2 - r), and r is
+the fraction of the loading energy that the rubber loses. After a reversal, the factor changes
+linearly with the finger's travel.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ REVERSAL_RATIO = 0.2
 of the depth."""
 
 MIN_REVERSAL_M = 4e-4
-"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. With a
-smaller value, tremor would reverse the hysteresis at small depths."""
+"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. If the
+value were smaller, tremor would reverse the hysteresis at small depths."""
 
 
 class HysteresisCorrection:

@@ -69,6 +69,7 @@ def limit_jerk(
     """Return the mean velocity and the acceleration (n,) of the next step.
 
     goal_velocity: velocity (n,) to reach.
+
     The acceleration stays within its limit, and changes by at most max_jerk * step_s.
     """
     change = goal_velocity - mean_velocity
@@ -183,6 +184,7 @@ def divide_edge_speed(
     """Return the factors (0..1) for linear and angular speed that respect the edges' speed limit.
 
     speeds, distances: linear and angular speed (m/s, rad/s), and remaining distances (m, rad).
+
     The speed limit is divided in proportion to the remaining distances. A part that one motion does
     not need is available to the other motion.
     """

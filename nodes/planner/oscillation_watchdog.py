@@ -14,15 +14,15 @@ MIN_AMPLITUDE_M = 2e-4
 """The root mean square amplitude of the depth below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""The ratio of the amplitudes in the second and the first half of the window that triggers the
-watchdog."""
+"""The ratio of two amplitudes (second half of the window to first half) that triggers the watchdog.
+"""
 
 STEADY_RATIO = 0.95
-"""The ratio of the amplitudes in the second and the first half of the window above which an
-oscillation does not decay."""
+"""The ratio of two amplitudes (second half of the window to first half) above which an oscillation
+does not decay."""
 
 SUSTAINED_S = 1.5
-"""The time without decay of an oscillation after which the watchdog is triggered."""
+"""The time after which an oscillation that does not decay triggers the watchdog."""
 
 FADE_S = 0.3
 """The time in which the motion of the sheet's offset is reduced to zero."""
@@ -58,7 +58,8 @@ class OscillationWatchdog:
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
         """Add a measurement, and return the weight (0 to 1) of the offset's motion.
 
-        depth_m: measured depth. offset_m: offset of the sheet at the time of the measurement.
+        depth_m: measured depth.
+        offset_m: offset of the sheet at the time of the measurement.
         step_s: time since the last measurement.
         """
         if self._slow is None:

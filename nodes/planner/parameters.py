@@ -25,8 +25,8 @@ class PlannerParameters(NodeParameters):
     )
     actuation_delay_s: NonNegative = Field(
         default=0.036,
-        description="time from a fingertip's publication until the sheet has moved, s. With "
-        "measure_actuation_delay, it is the initial value",
+        description="time from a fingertip's publication until the sheet has moved, s. If "
+        "measure_actuation_delay is true, this is the initial value",
     )
     measure_actuation_delay: bool = Field(
         default=True, description="whether to use the actuation delay that the arms measure"

@@ -23,8 +23,9 @@ MIN_STEP_RATIO = 1.0 / 512.0
 """The resolution of the search of `limit_tilt`, as a fraction of the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""The finer resolution of the search, and the distance from the maximum tilt beyond which the finer
-resolution is used. Deep inside the object, a small step can rotate the normal by many degrees."""
+"""The finer resolution of the search, which is used while the tilt is below the maximum tilt by
+more than NEAR_LIMIT_RAD. Deep inside the object, a small step can rotate the normal by many
+degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +83,10 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
     """Return the contact after the sheet has rolled to the surface point `found`.
 
-    The displacement of the contact on the sheet is the chord between both points, projected onto
-    the plane halfway between the tangent planes, and scaled to the length of the arc. The
-    displacement is exact on circles. On other curves, the error is of third order in the angle.
+    The displacement of the contact on the sheet follows from the chord between both points. The
+    chord is projected onto the plane halfway between the tangent planes, and scaled to the length
+    of the arc. The displacement is exact on circles. On other curves, the error is of third order
+    in the angle.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
@@ -107,6 +109,7 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 
     home: axes (3, 3) of the sheet before they are rotated to the normal.
     half_width_m: maximum distance of the contact from the sheet's centre.
+
     The contact is on the sheet's horizontal centre line. Within the maximum distance, the sheet's
     centre is aligned with the object's origin along the sheet's x axis.
     """
@@ -119,6 +122,7 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre for a given velocity of the contact.
 
     rate: velocity (3,) m/s of the contact on the object.
+
     The twist consists of linear velocity (m/s) and angular velocity (rad/s). The angular velocity
     is n x dn/dt with the normal n. The sheet's point in contact is at rest.
     """
@@ -134,7 +138,9 @@ def compute_tangent_twist(
 ) -> Floats:
     """Return the twist (6,) of a waiting sheet while its surface point moves.
 
-    rate: velocity (3,) m/s of the surface point. home, half_width_m: see `make_tangent_contact`.
+    rate: velocity (3,) m/s of the surface point.
+    home, half_width_m: see `make_tangent_contact`.
+
     With the normal n and the third axis h of `home`, the angular velocity of the sheet is n x dn/dt
     plus -(h x n) . dn/dt / (1 + h . n) about the normal.
     """
@@ -176,7 +182,9 @@ def limit_tilt(
     """Return the last surface point within the maximum tilt between `start` and `found`.
 
     The second result is whether this point differs from `found`.
+
     front: unit vector (3,) from which the tilt is measured.
+
     The search follows the straight line to `found` in increasing steps, and projects each step onto
     the surface.
     """

@@ -23,8 +23,9 @@ def check_stiffness(
 ) -> tuple[SelfCheck, ...]:
     """Compare Young's modulus times thickness in the scene with the calibrated product.
 
-    Returns () without a calibration. The two values must agree, because the rendered forces depend
-    on the calibration, and the sag and the limits of the edge force depend on the scene.
+    Returns () if there is no calibration. The two values must agree, because both are used. The
+    rendered forces depend on the calibration. The sag and the limits of the edge force depend on
+    the scene.
     """
     if calibration is None:
         return ()

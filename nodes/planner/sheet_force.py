@@ -40,7 +40,7 @@ def make_rubber(sheet: SheetSpec) -> Rubber:
 def make_force_model(
     sheet: SheetSpec, calibration: SheetCalibration | None = None
 ) -> SheetForceModel:
-    """Return the force model of a calibrated sheet, or of ideal rubber without a calibration.
+    """Return the force model of a calibrated sheet, or of ideal rubber if there is no calibration.
 
     Raises CalibrationMismatchError if the calibrated sheet has another size.
     """
@@ -78,7 +78,8 @@ def compute_membrane_table(
 ) -> TabulatedSheetModel:
     """Compute a table of the sheet's force by finite elements of the membrane.
 
-    stretches: stretch ratios (n,). xs_m, ys_m: coordinates of the pushes on the sheet.
+    stretches: stretch ratios (n,).
+    xs_m, ys_m: coordinates of the pushes on the sheet.
     progress: function that receives the number of finished pushes and the total number of pushes.
     """
 
@@ -105,8 +106,8 @@ def compute_membrane_table(
 
 BENCHMARK_DEPTHS_M = (0.002, 0.005, 0.010, 0.020, 0.040)
 SLOW_DEPTHS_M = (0.005, 0.020)
-"""The push depths at which slow models are benchmarked, with the mean stretch at the sheet's
-centre."""
+"""The push depths at which slow models are benchmarked. These models are benchmarked only at the
+mean stretch and at the sheet's centre."""
 BENCHMARK_POSITIONS: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
     ("off-centre", 0.13, 0.19),

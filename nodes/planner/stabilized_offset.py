@@ -15,8 +15,8 @@ class StabilizedOffset:
     """A filter that computes the sheet's offset behind the object's tangent plane.
 
     The filter of the module `hand_loop` smooths the measured depth. The depth is not predicted over
-    the whole delay, because a prediction would shift the least stable frequency of the control loop
-    into the range of hand oscillations. The offset never exceeds the depth, so the sheet stays in
+    the whole delay. A prediction would shift the least stable frequency of the control loop into
+    the range of hand oscillations. The offset never exceeds the depth, so the sheet stays in
     contact with a finger that moves away.
     """
 
@@ -39,7 +39,7 @@ class StabilizedOffset:
 
         offset_at_depth: function from the depth (m) to the offset (m).
         step_s: time since the last measurement.
-        bandwidth_rad_per_s: bandwidth of the depth filter; infinite for no filter.
+        bandwidth_rad_per_s: bandwidth of the depth filter; infinite if there is no filter.
         delay_s: time from a measurement until the sheet has moved.
         """
         if measured_depth_m <= 0.0:

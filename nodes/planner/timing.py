@@ -5,7 +5,7 @@ from __future__ import annotations
 from flexsheet.messages.types import Side
 
 RESTART_COUNT = 3
-"""The number of consecutive late fingertips that indicate a clock that was set back."""
+"""The number of consecutive late fingertips that indicate that a clock was set back."""
 
 MIN_STEP_NS = 1_000_000
 """The minimum plausible interval between two exposures. No camera is faster."""
@@ -20,7 +20,7 @@ constant is 1.7 s."""
 
 
 class MonotonicTimestampFilter:
-    """A filter that drops fingertips with a timestamp before that of the last accepted fingertip.
+    """A filter that drops each fingertip whose timestamp is before the last accepted timestamp.
 
     After `RESTART_COUNT` consecutive late fingertips, the filter restarts, because the clock was
     then set back.

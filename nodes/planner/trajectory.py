@@ -37,7 +37,7 @@ MAX_DEPTH_FRACTION = 1.4
 through the object."""
 
 MAX_STEP_S = 0.1
-"""The time without fingertips after which the sheet restarts from rest, because the arms have
+"""The time since the last fingertip after which the sheet restarts from rest, because the arms have
 stopped."""
 
 KEEP_S = 0.15

@@ -34,7 +34,7 @@ class BagRecording:
     the last messages of all latched topics. Disk errors during writing are passed to `on_error` and
     not raised.
 
-    note: state of the recording in one line.
+    note: state of the recording, as one line of text.
     lost: number of messages that were lost since the last bag.
     """
 

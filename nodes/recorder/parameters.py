@@ -27,8 +27,8 @@ class RecorderParameters(NodeParameters):
     )
     compress: bool | None = Field(
         default=None,
-        description="whether the bag is compressed; null: only if it has no images, because their "
-        "compression takes long",
+        description="whether the bag is compressed; null: the bag is compressed only if it has no "
+        "images, because their compression takes long",
     )
     start_paused: bool = Field(
         default=False,

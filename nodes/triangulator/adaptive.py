@@ -65,7 +65,8 @@ RECENT_S, RECENT_POINTS = 0.2, 10
 
 OUTDATED_RATIO = 1.5
 """The error ratio above which the error covariance is outdated because the motion has changed. The
-ratio is the mean square error of the weighted sum divided by that of the best model."""
+ratio is the mean square error of the weighted sum divided by the mean square error of the best
+model."""
 
 OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
 """The time constant and the minimum number of points for averaging an outdated error covariance."""
@@ -90,8 +91,8 @@ MIN_GAIN = 0.1
 which has a relative error of about 0.1."""
 
 START_POINTS = 32
-"""The number of points at the start of a track with time-varying Kalman gains. Later points use the
-steady-state gains."""
+"""The number of points at the start of a track for which the Kalman gains vary with time. Later
+points use the steady-state gains."""
 
 INITIAL_SPEED_M_PER_S, INITIAL_ACCELERATION = 0.1, 1.0
 """The standard deviations of speed (m/s) and acceleration (m/s^2) at the start of a track."""
@@ -188,6 +189,7 @@ def solve_riccati(transition: Floats, process_noise: Floats, variance: float) ->
     """Return the steady-state error covariances (models, 5, 5) just before each measurement.
 
     variance: variance of the measurement noise, m^2.
+
     The doubling algorithm (Chu et al. 2004) solves the Riccati equation.
     """
     rows, identity = transition.transpose(0, 2, 1), np.eye(STATES)
@@ -207,6 +209,7 @@ def _solve_gains(interval: int, noise: int) -> Floats:
     """Return the Kalman gains (START_POINTS, models, 5) of one axis for the points of a track.
 
     interval, noise: indices on the grid of frame intervals and noise variances.
+
     The first gains apply to the points 2 to START_POINTS. The last gain is the steady-state gain.
     """
     dt, variance = INTERVAL_RATIO**interval, NOISE_RATIO**noise
@@ -284,6 +287,7 @@ def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
 
     horizons: bytes of a float64 array (n,) of horizons, s. The cache requires hashable arguments.
     ages_ms: age, ms, for which the weights of each scored horizon were computed.
+
     The last factor applies to the correction by the filtered position, and decreases from one at
     the horizon zero to zero at the first age.
     """
@@ -299,6 +303,7 @@ def combine(covariance: Floats) -> Floats:
     """Return the weights (..., models) that minimise the mean square error of the weighted sum.
 
     covariance: covariance (..., models, models) of the models' prediction errors, in any unit.
+
     The sum of the weights is 1. Measurement noise does not change the result, because the noise is
     the same for all models.
     """
@@ -458,7 +463,8 @@ class AdaptiveBank:
 def _forget(dt: float, memory_s: float, memory_points: int) -> float:
     """Return the weight of a new value in an exponential average.
 
-    dt: time since the last value, s.  memory_s: time constant of the average.
+    dt: time since the last value, s.
+    memory_s: time constant of the average.
     memory_points: minimum number of points in the average.
     """
     return min(-math.expm1(-dt / memory_s), 1.0 / memory_points)
@@ -506,6 +512,7 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
     """Rotate the axes of an estimate to axes along which the noise of a new point is uncorrelated.
 
     covariance: noise covariance (3, 3), m^2, of the new point.
+
     Returns the estimate and the noise variances (3,), m^2, along its axes.
     """
     noise = estimate.axes.T @ covariance @ estimate.axes

@@ -177,7 +177,9 @@ def _marker_trial(
         return refine([image] * len(blobs), blobs, sensor)
 
     def error_px(_: list[Marker]) -> Interval:
-        """Return the root mean square error (px) per axis, or the image size without a marker."""
+        """Return the root mean square error (px) per axis, or the image size if no marker was
+        found.
+        """
         found = [markers_in(image) for image in images]
         off = [
             markers[0].centre - centre if len(markers) == 1 else np.full(2, float(IMAGE_PX))

@@ -1,11 +1,11 @@
 """Associate the markers of each image pair with the finger and with clutter.
 
-Clutter is every marker-like spot that is not the finger's marker, such as a marker outside the
-finger's gate (the region in which the finger is expected). Clutter is tracked too, so clutter is
-not confused with a finger that was hidden or merged with clutter. Markers are assigned to tracks by
-position and brightness with the global nearest neighbour method (Bar-Shalom, Li, Kirubarajan,
-Estimation with Applications to Tracking and Navigation). If another assignment is about as likely,
-no fingertip is reported.
+Clutter is every marker-like spot that is not the finger's marker. A marker outside the finger's
+gate (the region in which the finger is expected) counts as clutter. Clutter is tracked too, so
+clutter is not confused with a finger that was hidden or merged with clutter. Markers are assigned
+to tracks by position and brightness with the global nearest neighbour method (Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation). If another assignment is
+about as likely, no fingertip is reported.
 """
 
 from __future__ import annotations
@@ -97,14 +97,15 @@ STATIONARY_TIME_S = 1.5
 """The time after which a marker that stays within STATIONARY_RADIUS_M is stationary."""
 
 TRACK_TIMEOUT_S = 1.0
-"""The time without detections after which the track of a moving marker is deleted."""
+"""The time since the last detection after which the track of a moving marker is deleted."""
 
 STATIONARY_TRACK_TIMEOUT_S = 10.0
-"""The time without detections after which the track of a stationary marker is deleted."""
+"""The time since the last detection after which the track of a stationary marker is deleted."""
 
 MIN_HITS = 3
 TENTATIVE_TRACK_TIMEOUT_S = 0.1
-"""The timeout of a tentative track with fewer than MIN_HITS detections."""
+"""The time since the last detection after which a tentative track is deleted if it has fewer than
+MIN_HITS detections."""
 
 SOLE_CANDIDATE_TIME_S = 1.0
 """The time after which the only visible marker is assigned to the finger, even if it is
@@ -382,6 +383,7 @@ class DataAssociation:
         """Assign the markers of an image pair to tracks, and update or create the clutter tracks.
 
         finger: track of the finger; None if the finger is not tracked.
+
         Returns the clutter track of each marker, or None for the finger's marker.
         """
         self.clutter_tracks = [track for track in self.clutter_tracks if track.is_alive(at_ns)]
@@ -439,6 +441,7 @@ def assign_columns(costs: Floats) -> list[int]:
     """Assign a different column to each row so that the sum of the costs is minimal.
 
     costs: cost matrix (n, m) with n <= m.
+
     Returns the column of each row. The algorithm finds shortest augmenting paths (Jonker and
     Volgenant, 1987). Importing the equivalent function of SciPy would take a third of a second.
     """

@@ -25,7 +25,7 @@ from flexsheet.nodes.arrays import Floats
 
 NODE_SPACING = 1.4
 """The maximum distance between integration nodes on the edge, in standard deviations of the blur.
-With this distance, the error of the computed light is below 0.001."""
+At this distance, the error of the computed light is below 0.001."""
 
 MIN_NODES, MAX_NODES = 12, 64
 """The bounds on the number of integration nodes. The maximum is sufficient for a sharp marker with

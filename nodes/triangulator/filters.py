@@ -1,6 +1,6 @@
 """Define filters that estimate and predict the finger's position from measured points.
 
-Points are (3,) in the world frame, m, with covariances (3, 3) m^2.
+Points are arrays (3,) in the world frame, in m. Their covariances are matrices (3, 3), in m^2.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from flexsheet.nodes.models.one_euro import OneEuro
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The state of a filter at the time `at_ns`, and a covariance.
+    """The state of a filter at the time `at_ns`, and the covariance that belongs to it.
 
-    Each tracking method defines the shapes of both arrays.
+    Each tracking method defines the shapes of `state` and `covariance`.
     """
 
     at_ns: int
@@ -27,7 +27,7 @@ class Estimate:
 
 
 class Filter(Protocol):
-    """The interface that every tracking method implements.  Estimates are immutable."""
+    """The interface that every tracking method implements. Estimates are immutable."""
 
     def initialize(self, at_ns: int, measured: Floats, covariance: Floats) -> Estimate:
         """Make the first estimate from a measured point (3,), m, with a covariance (3, 3), m^2."""

@@ -1,7 +1,7 @@
 """Detect the fingertip's marker in a stereo image pair.
 
-Bright blobs are detected in each image and matched to pairs. The centres of likely pairs are
-refined to subpixel accuracy and triangulated. Pairs that cannot be the marker receive a rejection
+Bright blobs are detected in each image and matched in pairs. The centres of likely pairs are
+refined to subpixel accuracy and triangulated. Pairs that cannot be the marker are rejected with a
 reason.
 """
 
@@ -40,30 +40,31 @@ from flexsheet.nodes.triangulator.triangulation import (
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
-"""The standard deviation of the logarithm of a blob's radius divided by the expected radius."""
+"""The standard deviation of the logarithm of a blob's size ratio: its radius / expected radius."""
 
 HEIGHT_SIGMA = 0.25
-"""The standard deviation of the logarithm of a marker's brightness in the left view divided by that
-in the right view."""
+"""The standard deviation of the logarithm of a brightness ratio: the marker's brightness in the
+left view divided by its brightness in the right view."""
 
 MISFIT_SIGMA_PX = 0.5
 """The standard deviation of the distance between the two rays of an unrefined marker, projected
 into the images."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""The maximum absolute logarithm of a blob's radius divided by the expected radius: 0.55 to 1.8
-times the expected radius."""
+"""The maximum absolute logarithm of a blob's size ratio. The radius is then 0.55 to 1.8 times the
+expected radius."""
 
 SIZE_SIGMAS = 3.5
 """The maximum deviation of a refined marker's radius from the expected radius, in standard
-deviations. With a larger deviation, the marker is partly occluded or merged with a bright spot."""
+deviations. If the deviation is larger, the marker is partly occluded or merged with a bright spot.
+"""
 
 MARKER_SIZE_SIGMA = 0.035
 """The relative standard deviation of the radii of manufactured markers."""
 
 STEREO_SIZE_SIGMAS = 4.5
-"""The maximum difference of a marker's radius between both views, in standard deviations. With a
-larger difference, the marker is partly occluded in one view."""
+"""The maximum difference of a marker's radius between both views, in standard deviations. If the
+difference is larger, the marker is partly occluded in one view."""
 
 MAX_MOTION_DIFFERENCE_PX = 2.5
 """The maximum difference between both views in a marker's motion during the exposure."""
@@ -109,7 +110,7 @@ class BlobPair:
     """A pair of blobs in the left and the right image that may show the same marker.
 
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
-    gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 without a
+    gate_fraction: distance from the gate's centre divided by the gate's radius; 0 if there is no
         gate.
     cost: sum of the squared deviations of rays, sizes, brightness and distance from the gate's
         centre, in squared standard deviations.
@@ -161,7 +162,7 @@ class StereoDetection:
     def correct_points(
         self, correct: Callable[[TriangulatedPoint], TriangulatedPoint]
     ) -> StereoDetection:
-        """Return the same detection with a correction of all triangulated points."""
+        """Return a copy of this detection in which all triangulated points are corrected."""
         measured = None if self.measured is None else correct(self.measured)
         markers, clutter = (
             tuple(replace(one, measured=correct(one.measured)) for one in candidates)
@@ -199,6 +200,7 @@ def detect_all(
     volume: minimum and maximum corner (3,) m of the finger's working volume in the world frame.
     gate: region to search; None to search both full images, which must contain only one marker.
     left_origin_px, right_origin_px: column and row of each image's first pixel on the sensor.
+
     If the finger is not found inside the gate, the full images are searched for other markers.
     """
     if gate is not None and not np.isfinite(gate.point).all():
@@ -247,7 +249,7 @@ def _match_in(
 ) -> StereoDetection:
     """Detect markers in one window of each image.
 
-    windows: windows of the left and right image; None for the full image.
+    windows: windows of the left and right image; None means the full image.
     """
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
@@ -325,7 +327,7 @@ def _match_blobs(
 class RefinedPair:
     """A pair of blobs with refined markers.
 
-    rejection_reason: reason why the pair cannot be the marker; None for a valid marker.
+    rejection_reason: reason why the pair cannot be the marker; None if the marker is valid.
     cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
         standard deviations.
     """
@@ -438,7 +440,7 @@ def _flat_pose(
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the markers of refined pairs, sorted by cost, without wrong pairs of two markers.
+    """Return the markers of refined pairs, sorted by cost, and drop pairs of two different markers.
 
     A pair is dropped if both blobs belong to pairs with lower costs, or if one blob belongs to a
     pair with a much lower cost.
@@ -483,7 +485,7 @@ def _refine_markers(
 def _rejection_reason(
     inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]
 ) -> FingertipReason | None:
-    """Return the reason why a refined pair cannot be the marker, or None for a valid marker."""
+    """Return the reason why a refined pair cannot be the marker, or None if the marker is valid."""
     for marker in markers:
         if marker.rejection_reason is not None:
             return marker.rejection_reason

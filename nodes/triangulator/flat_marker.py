@@ -22,7 +22,7 @@ from flexsheet.nodes.arrays import Floats
 class DiscView:
     """A flat disc as seen by one camera.
 
-    camera_from_left: rotation (3, 3) from the left camera's axes to those of this camera.
+    camera_from_left: rotation (3, 3) from the left camera's axes to the axes of this camera.
     point: centre (3,) m of the disc in this camera's frame.
     jacobian: derivative (2, 3), px/m, of the pixel with respect to the point.
     axes: symmetric matrix A (2, 2), px, of the ellipse's edge; see the module `ellipse`.
@@ -81,7 +81,8 @@ def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
 
 
 def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
-    """Return the maximum difference (px) between the semi-axes of measured and computed ellipse.
+    """Return the maximum difference (px) between the semi-axes of the measured and computed
+    ellipses.
 
     normal: normal (3,) of the disc in this camera's axes.
     """
@@ -97,6 +98,7 @@ def _centre_offset_px(view: DiscView, normal: Floats, radius_m: float) -> Floats
     """Return the offset (2,), px, from the image of a disc's centre to the centre of its ellipse.
 
     normal: normal (3,) of the disc in the left camera's axes.
+
     The centre of the ellipse is computed from the dual conic of the disc. The lens distortion is
     linearised.
     """

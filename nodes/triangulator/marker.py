@@ -29,7 +29,7 @@ Window = tuple[slice, slice]
 """The rows and columns of a rectangular part of an image."""
 
 NEIGHBOURHOOD_PX = 31
-"""The side of the square around a pixel. The mean grey level of the square is the threshold."""
+"""The side of the square around a pixel whose mean grey level is the threshold for this pixel."""
 
 SURROUND_PX = 3
 """The width of the border around a blob. The outermost pixels determine the grey level of the
@@ -74,9 +74,10 @@ class Blob:
     """A bright blob that may be a marker. Lengths are in pixels of the searched image.
 
     centre: centroid of the blob's light.
-    radius: radius of the disc that has the same area as the pixels above half the height.
+    radius: radius of the disc that has the same area as the blob's pixels above half its `height`.
     motion: displacement (x, y) during the exposure, estimated from the second moments of the light.
-    spread: smallest second moment of the light, divided by that of a uniform disc with this radius.
+    spread: smallest second moment of the light, divided by the second moment of a uniform disc with
+        this radius.
     peak, surround: grey levels of the brightest pixel and of the surroundings.
     window: part of the image that contains the blob and its surroundings.
     """
@@ -114,7 +115,7 @@ class Marker:
     elongation: vector (e, f), px, for a flat marker that is seen at an angle; see the module
         `ellipse`.
     height: difference of grey levels between the marker and its surroundings.
-    rejection_reason: reason why the blob is not a marker; None for a valid marker.
+    rejection_reason: reason why the blob is not a marker; None if the marker is valid.
     """
 
     centre: Floats
@@ -135,8 +136,9 @@ Refine = Callable[[Sequence[Image], Sequence[Blob], PixelNoise], list[Marker]]
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
     """Return the square window around a pixel (x, y), clipped to the image.
 
-    shape: size (height, width) of the image. half_px: number of pixels by which the window extends
-        on each side.
+    shape: size (height, width) of the image.
+    half_px: number of pixels by which the window extends on each side.
+
     Returns None if the window is outside the image.
     """
     x, y = pixel.tolist()
@@ -246,7 +248,7 @@ def _make_blob(
     """Compute centre, radius, motion and spread of the blob in a window of an image part.
 
     cut: pixels of the window.
-    area: number of pixels above half the height.
+    area: number of pixels above half the blob's height (its grey levels above its surroundings).
     origin: row and column at which the part begins in the image.
     """
     rows, columns = window
@@ -295,7 +297,7 @@ MAX_SPREAD = 1.7
 class SystematicError:
     """The systematic errors of a refinement method, as standard deviations per axis.
 
-    still_px: error by the pixel grid and an uneven background.
+    still_px: error that the pixel grid and an uneven background cause.
     moving: additional error of a moving marker, as a fraction of its motion during the exposure.
     """
 
@@ -316,7 +318,10 @@ BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
 
 
 def moments(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
-    """Refine blobs to the unweighted centroid of the pixels above half the marker's height."""
+    """Refine each blob's centre to the unweighted centroid of its brighter pixels.
+
+    A pixel is used if its grey level is above the mean of `Blob.peak` and `Blob.surround`.
+    """
     markers = []
     for image, blob in zip(images, blobs, strict=True):
         level = 0.5 * (blob.surround + blob.peak)
@@ -382,12 +387,13 @@ def _make_marker(
 
 
 MAX_ELLIPSE_MISFIT = 0.035
-"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height.
-The limit is smaller than for a disc, because an ellipse fits a partly covered disc well."""
+"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height
+(its grey levels above its surroundings). The limit is smaller than for a disc, because an ellipse
+fits a partly covered disc well."""
 
 MAX_ODD_MISFIT = 0.03
-"""The maximum residual of a fitted ellipse that is odd about the centre, as a fraction of the
-marker's height. A partly covered disc has larger odd residuals."""
+"""The maximum odd (antisymmetric about the centre) part of the residual of an ellipse fit, as a
+fraction of the marker's height. A partly covered disc has larger odd residuals."""
 
 
 def fit_flat_markers(
@@ -420,5 +426,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""The refinement of flat markers for each method. Methods without an entry detect round markers
+"""The refinement of flat markers for each method. A method that has no entry detects round markers
 only."""

@@ -49,7 +49,7 @@ from flexsheet.nodes.triangulator.triangulation import (
 )
 
 TIMEOUT_PERIODS = 2.5
-"""The minimum timeout of a track, in periods of the camera, for one missing image pair."""
+"""The minimum timeout of a track, in frame periods, so that one image pair may be missing."""
 
 
 SAME_POINT_M = 0.001

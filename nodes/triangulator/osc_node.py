@@ -234,7 +234,9 @@ class OscInput(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Reopen the port if it is closed, and publish invalid messages for inputs without data."""
+        """Reopen the port if it is closed, and publish invalid messages for inputs that get no
+        data.
+        """
         if self.transport is None:
             await self._open()
         else:

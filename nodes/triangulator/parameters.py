@@ -43,7 +43,8 @@ class TriangulatorParameters(NodeParameters):
     )
     marker_min_contrast: Positive = Field(
         default=60.0,
-        description="minimum contrast of a marker: its grey level minus that of its surroundings",
+        description="minimum contrast of a marker: its grey level minus the grey level of its "
+        "surroundings",
     )
     marker_min_area_px: Annotated[int, Field(ge=1)] = Field(
         default=4, description="minimum area of a marker in an image, pixels"

@@ -3,8 +3,8 @@
 A mark is on the ray of its projector pixel for any position of the sheet. The distance from this
 ray therefore indicates errors of the projector and the camera. The distance from the expected
 surface of the sheet indicates errors of the arms and the camera. Near a finger that pushes the
-sheet, the surface moves in a known ratio to the finger pad, so the marks indicate errors of the
-pad's depth.
+sheet, the surface moves by a known fraction of the pad's motion. There the marks indicate errors of
+the pad's depth.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ MAX_SPREAD_M = 0.004
 """The maximum difference between the offset of a mark and the median offset of all marks."""
 
 MAX_AGE_NS = 300_000_000
-"""The maximum age of the newest frame at the exposure."""
+"""The maximum age of the newest displayed frame at the exposure of an image pair."""
 
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
 """The speed of the marks below which positions are checked, and above which latency is checked."""
 
 MAX_DRIFT_M = 3e-4
-"""The maximum motion of a mark along the sheet's normal between frame and exposure for a check of
-the heights."""
+"""The maximum motion of a mark along the sheet's normal between frame and exposure. If a mark moves
+more, its height above the sheet is not checked."""
 
 MAX_GAIN = 4.0
 """The maximum ratio of the standard deviations of the finger's estimated depth and a mark's height.
-With a larger ratio, the marks are too far from the finger, and the depth is not estimated."""
+If the ratio is larger, the marks are too far from the finger, and the depth is not estimated."""
 
 
 class ProjectionCheck:
-    """The self-checks of projector, arms and finger marker by projected marks.
+    """The self-checks that use projected marks to test the projector, the arms and the marker.
 
     projector: projector of the scene; None if there is no projector.
     """
@@ -97,8 +97,8 @@ class ProjectionCheck:
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
         """Compare the bright points (3,), m, of an image pair with the expected marks.
 
-        camera_shift_m: displacement (3,) of the fixed reference marks by an error of the camera's
-            pose.
+        camera_shift_m: displacement (3,) of the fixed reference marks that an error of the camera's
+            pose causes.
         at_ns: time of the image pair.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
@@ -145,6 +145,7 @@ class ProjectionCheck:
         """Return the velocities (n, 3), m/s, of the marks in a frame; NaN for marks off the sheet.
 
         number: index of the frame in `_frames`.
+
         Returns None if no velocity is known.
         """
         if number == 0:

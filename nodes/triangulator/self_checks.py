@@ -49,8 +49,10 @@ class CameraCheck:
     """The self-checks of the stereo camera and of the marker.
 
     reference_marks: world positions (n, 3), m, of fixed marks that look like the finger's marker.
-    touch_point: world position (3,), m, of a known point that the finger can touch, or None.
-    projector: projector of the scene, which may project check marks on the sheet, or None.
+    touch_point: world position (3,), m, of a known point that the finger can touch; None if no
+        point is known.
+    projector: projector of the scene, which may project check marks on the sheet; None if there is
+        none.
     """
 
     def __init__(
@@ -117,7 +119,8 @@ class CameraCheck:
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
         """Add a position of the finger pad, and check it if the finger rests at the known point.
 
-        point: world position (3,), m. reprojection_px: reprojection error of the finger's marker.
+        point: world position (3,), m.
+        reprojection_px: reprojection error of the finger's marker.
         """
         self._reprojection.add(np.array([reprojection_px]), at_ns)
         if self._touch_point is None:

@@ -21,6 +21,7 @@ def compensate_skew(
 
     skew_s: time of the right exposure minus the time of the left exposure.
     velocity: velocity (3,), m/s, of the finger in the world, with its covariance (3, 3).
+
     The corrected point is the finger's position at the mean time of both exposures. To first order,
     a finger with velocity v is measured with the error M v, where M = s (A_r J_r - I/2). Here s is
     the skew, J_r the Jacobian of the right pixel, and A_r the derivative of the triangulated point

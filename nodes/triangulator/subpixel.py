@@ -60,7 +60,7 @@ PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
 """The inverse variances of the parameters' starting values. The starting values only affect
-parameters without information in the pixels, such as the level of a saturated marker."""
+parameters that the pixels do not determine, such as the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 """The lower bounds (px) on the radius and the blur of a fitted disc."""
@@ -82,17 +82,17 @@ MOTION_STEP_PX = 1.8
 """The maximum distance between the positions over which the image of a moving disc is averaged."""
 
 MIN_MOTION_PX = 2.0
-"""The minimum motion that is fitted.  A shorter motion cannot be distinguished from blur."""
+"""The minimum motion that is fitted. A shorter motion cannot be distinguished from blur."""
 
 PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
 ITERATIONS = 8
 CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
-"""The last steps of centre (x, y), radius and blur below which a fit has converged. The remaining
-error (squared step divided by blur) is less than 0.001 px."""
+"""The step sizes of centre (x, y), radius and blur below which a fit counts as converged. The
+remaining error (squared step divided by blur) is less than 0.001 px."""
 
 CONVERGED_ELONGATION_PX = 0.05
-"""The last step of the elongation below which the fit of an ellipse has converged."""
+"""The step size of the elongation below which the fit of an ellipse counts as converged."""
 
 MAX_STEP_PX = 0.7
 """The maximum change of a shape parameter in one step of the fit."""
@@ -166,7 +166,9 @@ def fit_discs(
 ) -> list[DiscFit]:
     """Fit one disc in each image (height, width).
 
-    starts: starting values, one per image. noise: noise of the image sensor.
+    starts: starting values, one per image.
+    noise: noise of the image sensor.
+
     Pixels outside the image and outside the disc's surroundings are excluded. A saturated (white)
     pixel is used only in iterations in which the model is darker than the pixel.
     """
@@ -191,6 +193,7 @@ def fit_ellipses(
 
     starts: starting values of moving discs. Each ellipse starts with the second moments of its
         disc.
+
     The ellipses are fitted one by one, because the computing time increases with the third power of
     the largest ellipse's size.
     """
@@ -382,10 +385,11 @@ def _cut_out_discs(
 
 
 def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the grey levels (n, s s) of discs, and derivatives (n, parameters, s s).
+    """Return the grey levels (n, s s) of n discs in s x s pixels, and derivatives (n, parameters, s
+    s).
 
-    found: parameters (n, parameters) of the discs. x, y: coordinates of the pixels, (1, 1, s) and
-        (1, s, 1).
+    found: parameters (n, parameters) of the discs.
+    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
 
     A moving (motion-blurred) disc is averaged over k positions, in arrays (n, k, s, s).
     """
@@ -431,10 +435,12 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the grey levels (n, s s) of ellipses, and derivatives (n, parameters, s s).
+    """Return the grey levels (n, s s) of n ellipses in s x s pixels, and their derivatives.
 
-    found: parameters (n, parameters) of the ellipses. x, y: coordinates of the pixels, (1, 1, s)
-        and (1, s, 1).
+    The derivatives have the shape (n, parameters, s s).
+
+    found: parameters (n, parameters) of the ellipses.
+    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
     """
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
@@ -483,7 +489,8 @@ def _make_fit(
 ) -> DiscFit:
     """Make the result of one fit, with a larger covariance if the residuals exceed the noise.
 
-    found: fitted parameters. corner: column and row of the cut-out's first pixel.
+    found: fitted parameters.
+    corner: column and row of the cut-out's first pixel.
     fitness: one element of the result of `_fit_residuals`.
     """
     squares, pixels, weight, ratio = fitness

@@ -43,7 +43,7 @@ class TrackingSettings:
 
     max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger's motion. Points outside these
         limits are rejected.
-    track_timeout_s: maximum time without a point before the track is lost.
+    track_timeout_s: maximum time since the last point before the track is lost.
     confirm_frames: number of consecutive consistent points that start or replace a track.
     """
 
@@ -153,6 +153,7 @@ class Tracker:
         """Predict position, velocity and path at the time `at_ns`, not before the newest point.
 
         horizons_s: times (n,) of the path's points after `at_ns`; the first time must be 0.
+
         If the track is lost, the predicted path stays at the last position.
         """
         estimate = self.estimate
@@ -261,7 +262,7 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Append a point to a sequence of points that the finger can follow, or start a new one."""
+        """Append a point to a sequence that the finger can follow, or start a new sequence."""
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]

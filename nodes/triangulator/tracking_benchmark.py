@@ -1,4 +1,4 @@
-"""Benchmark the tracking methods by the error of the predicted finger position."""
+"""Benchmark the tracking methods: measure the error of the predicted finger position."""
 
 from __future__ import annotations
 
@@ -25,15 +25,14 @@ HORIZON_MS = "horizon_ms"
 """The key for the prediction horizon of a benchmark case."""
 
 HORIZONS_S = (0.0, 0.02, 0.05)
-"""The prediction horizons after the exposure: no prediction, display of the frame, motion of the
-arms."""
+"""The prediction horizons: the exposure itself, the display of the frame, and the arms' motion."""
 
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
 """The maximum ratio of a path's speed to the scene's speed. The ratio permits tremor."""
 WITHOUT_VELOCITY = ("none",)
-"""The methods without an estimate of velocity, which cannot predict a moving finger."""
+"""The methods that do not estimate the velocity, and so cannot predict a moving finger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +59,9 @@ class TruePathCase:
 class MeasuredPath:
     """The simulated measurements of a path at n times.
 
-    times_ns: times (n,). points: measured points (n, 3), m. covariances: covariances (n, 3, 3),
-        m^2.
+    times_ns: times (n,).
+    points: measured points (n, 3), m.
+    covariances: covariances (n, 3, 3), m^2.
 
     truth: true points (n, 3), m, at the predicted times, for each prediction horizon.
     """
@@ -75,9 +75,10 @@ class MeasuredPath:
 def measure_path(
     scene: Scene, motion: TruePathCase, *, seed: int, noise_px: float = MARKER_NOISE_PX
 ) -> MeasuredPath:
-    """Simulate the measurement of a finger's path by the scene's stereo camera.
+    """Simulate how the scene's stereo camera measures a finger's path.
 
-    seed: seed of the random noise. noise_px: standard deviation of a marker's centre.
+    seed: seed of the random noise.
+    noise_px: standard deviation of a marker's centre.
     """
     geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
     times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)

@@ -51,6 +51,7 @@ class StereoGeometry:
 
         calibration: source of the lens parameters; None to use the values of the scene. The pose
             always comes from the scene.
+
         Raises CalibrationMismatchError if the calibration belongs to another camera.
         """
         optics: StereoCamera | StereoCalibration = scene_camera
@@ -82,7 +83,7 @@ class StereoGeometry:
         return project_with_jacobian(point, self.matrices[view], self.distortions[view])
 
     def undistort(self, view: int, pixel: Floats) -> tuple[float, float] | None:
-        """Return the undistorted normalized coordinates of a pixel (2,); None if it is invalid.
+        """Return the undistorted normalized coordinates of a pixel (2,), or None if it is invalid.
 
         view: 0 for the left camera, 1 for the right camera.
         """
@@ -145,6 +146,7 @@ class ClosestApproach:
 
     rotation_rows: rows of the rotation from the right to the left camera's axes.
     origin: position of the right camera in the left camera's frame, m.
+
     The geometry is stored as Python numbers, which are faster than small arrays.
     """
 
@@ -165,6 +167,7 @@ class ClosestApproach:
         """Return the midpoint (3,), m, and the length (m) of the shortest segment between two rays.
 
         left, right: undistorted normalized coordinates (x, y) of the rays.
+
         Returns None if the rays are parallel, or if the segment is behind a camera.
         """
         (ax, ay), (ox, oy, oz) = left, self.origin
@@ -186,8 +189,11 @@ class ClosestApproach:
 def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
     """Triangulate points by the direct linear transform (homogeneous linear least squares).
 
-    left, right: undistorted normalized coordinates (n, 2). right_from_left: transform (4, 4).
+    left, right: undistorted normalized coordinates (n, 2).
+    right_from_left: transform (4, 4).
+
     Returns points (n, 3), m, in the left camera's frame.
+
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
     """
     projections = (np.eye(3, 4), right_from_left[:3])
@@ -300,11 +306,11 @@ def measure(
     """Triangulate a marker from its pixels (2,) in both views.
 
     covariance: covariance (2, 2), px^2, of the left pixel.
-    right_covariance: covariance (2, 2), px^2, of the right pixel; None if equal to that of the left
-        pixel.
+    right_covariance: covariance (2, 2), px^2, of the right pixel; None if it equals `covariance`.
 
     Both views have equal weights. The covariances are therefore propagated by (J^T J)^-1 J^T, with
     the Jacobian J of the four pixel coordinates with respect to the point.
+
     Returns None if the point is not in front of both cameras, or if a pixel is invalid for the lens
     model.
     """

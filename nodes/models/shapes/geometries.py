@@ -25,8 +25,8 @@ from flexsheet.nodes.models.shapes.solids import (
 from flexsheet.nodes.models.shapes.surface import Shape
 
 INNER_RATIO = 0.8
-"""The ratio of the size of the undistorted inner lattice of a round solid's mesh to the solid's
-size."""
+"""The size of the undistorted inner lattice in a round solid's mesh, divided by the solid's size.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,7 +59,7 @@ SPACING_RATIO = 1.0 / 3.0
 """The minimum distance between jets (local quadratic fits) on the same side of the surface, divided
 by the smoothing length `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""The minimum cosine of the angle between the normal of a local quadratic fit (jet) and that of a
+"""The minimum cosine of the angle between two normals: of a local quadratic fit (jet), and of a
 vertex that is used for the fit."""
 MAX_CURVATURE_RATIO = 2.0
 """The maximum curvature (1/m) of a local quadratic fit (jet), multiplied by the smoothing length
@@ -87,7 +87,7 @@ STRIDE_RATIO = 0.4
 Longer steps could leave the region in which the surface is defined.
 """
 REST_RATIO = 1e-3
-"""The step of the projection, divided by `rho`, below which it counts as converged.
+"""The step of the projection, divided by `rho`, below which the projection counts as converged.
 
 The remaining error is some nanometres in position and about 1e-5 rad in the normal.
 """
@@ -119,8 +119,8 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
     vertices (v, 3): positions, m.
     triangles (t, 3): indices of vertices.
 
-    With a shorter length, users would feel the facets. With a longer length, curved parts would be
-    flattened.
+    If the length were shorter, users would feel the facets. If it were longer, curved parts would
+    be flattened.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
@@ -136,8 +136,8 @@ class SmoothMeshShape:
         vertices_m (v, 3), triangles (t, 3): mesh.
         smoothing_m: smoothing length, m.
 
-        Raises MeshError for a mesh that does not bound a solid, or that is too small for the
-        smoothing length. Raises ValueError for a smoothing length that is not positive.
+        Raises MeshError if the mesh does not bound a solid, or is too small for the smoothing
+        length. Raises ValueError if the smoothing length is not positive.
         """
         check_positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
@@ -244,7 +244,7 @@ class SmoothMeshShape:
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
         """Return the nearest surface points of queries (n, 3), and whether they are ambiguous (n,).
 
-        before: nearest points (n, 3) of the previous queries, or None.
+        before: nearest points (n, 3) of the previous queries, or None if there are none.
         """
         if before is None:
             return self._find_global_nearest(queries)
@@ -454,8 +454,8 @@ class SmoothMeshShape:
         """Return the index of the jet (local quadratic fit) nearest to a point (3,), and nearby
         jets.
 
-        The k jets with a weight near the point are given by indices (k,), centres (k, 3), normals
-        (k, 3) and shape operators (k, 3, 3).
+        The k jets whose weights are not zero near the point are given by indices (k,), centres (k,
+        3), normals (k, 3) and shape operators (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -533,7 +533,7 @@ def _put(
     """Replace rows of `feet` by rows of `other`, in place.
 
     rows: indices of the replaced rows.
-    chosen: selects the rows of `other`.
+    chosen: mask or slice that selects the rows of `other`.
     """
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]
@@ -569,7 +569,7 @@ def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) 
     """Select vertices that are at least `spacing` (m) apart on each side of the surface; return
     their indices.
 
-    Every vertex that is not selected has a selected vertex within that distance on the same side.
+    Every vertex that is not selected has a selected vertex within `spacing` on the same side.
     """
     selected, covered = [], np.zeros(len(vertices), dtype=bool)
     for vertex in range(len(vertices)):
@@ -602,8 +602,9 @@ def _jet(
     """Fit a quadratic z(x, y) to the points `around` (m, 3) by weighted least squares.
 
     origin, rough (3,): vertex, and approximate normal at this vertex, which defines the z axis.
-        Lengths are scaled by the radius of the fit. If there are too few points, the solution of
-        minimum norm is used. Return the centre (3,), the normal (3,) and the shape operator (3, 3).
+
+    Lengths are scaled by the radius of the fit. If there are too few points, the solution of
+    minimum norm is used. Return the centre (3,), the normal (3,) and the shape operator (3, 3).
     """
     reach = FIT_RATIO * rho
     first = np.cross(rough, _IDENTITY[np.abs(rough).argmin()])

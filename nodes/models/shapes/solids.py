@@ -321,9 +321,9 @@ class RoundedBoxShape(Convex):
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
         """Return the face of the core that is nearest to each query (n, 3) inside the core.
 
-        before: previous nearest points (n, 3), or None. Only faces at these points are considered.
-            Without previous points, the first of equally near faces in the order z, y, x, -z, -y,
-            -x is chosen.
+        before: previous nearest points (n, 3), or None if there are none. Only faces at these
+            points are considered. If there are no previous points, the first of equally near faces
+            in the order z, y, x, -z, -y, -x is chosen.
 
         Return the axis (n,) and the sign (n,) of the face's normal, the distance from the face
         (n,), m, and whether the choice is ambiguous (n,).
@@ -355,8 +355,9 @@ def _directions(
 ) -> tuple[Floats, Floats, Bools]:
     """Return unit directions and lengths of offsets (..., 3), and whether each offset is zero.
 
-    across: indices of the coordinates in which the offsets may differ from zero. For a zero offset,
-        the direction is that of the previous point, or `FRONT` if there is none.
+    across: indices of the coordinates in which the offsets may differ from zero. If an offset is
+        zero, the direction from the origin to the previous point is returned, or `FRONT` if there
+        is no previous point.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)

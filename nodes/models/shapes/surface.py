@@ -29,8 +29,8 @@ MAX_QUERY_M = 1e6
 FRONT = np.array([0.0, 0.0, 1.0])
 """The direction in which the nearest point is chosen if several surface points are equally near.
 
-This direction is used if there is no previous point. Without a rotation of the object, the
-direction points to the user.
+This direction is used if there is no previous point. If the object is not rotated, the direction
+points to the user.
 """
 
 
@@ -42,8 +42,8 @@ class Nearest:
     height_m: height (...) of the query above the tangent plane at `point`, negative below it. The
         height equals the signed distance, except past an end of the surface.
     shape_operator: shape operator (..., 3, 3) at `point`, 1/m.
-    on_edge: whether `point` is on an edge of a mesh, or on the rim of the touchable surface with
-        the query beyond the rim. A sheet can touch such a point but cannot roll over it.
+    on_edge: whether `point` is on an edge of a mesh, or whether the query is beyond the rim of the
+        touchable surface. A sheet can touch such a point but cannot roll over it.
     undecided: whether another surface point is equally near. Then the previous point or `FRONT`
         determines the choice.
     """
@@ -78,8 +78,8 @@ class Shape(Protocol):
             of the distance that continues the previous point, as long as this minimum exists.
             Another point may be equally near, or nearer inside the object.
 
-        Raises ValueError for points that are not finite, not of shape (3,) or (n, 3), or beyond
-        `MAX_QUERY_M`.
+        Raises ValueError if points are not finite, have a shape other than (3,) or (n, 3), or are
+        beyond `MAX_QUERY_M`.
         """
         ...
 
@@ -108,7 +108,7 @@ class Convex:
     __slots__ = ()
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return 0."""
+        """Return 0, because a convex solid is never above its tangent plane."""
         return 0.0
 
 
@@ -167,9 +167,9 @@ def check_points(points: ArrayLike, name: str = "points") -> Floats:
 
 
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
-    """Convert the previous nearest points to a float array; return None for None.
+    """Convert the previous nearest points to a float array, or return None if there are none.
 
-    Raises ValueError for a shape other than that of `points`.
+    Raises ValueError if the shape differs from the shape of `points`.
     """
     if previous is None:
         return None

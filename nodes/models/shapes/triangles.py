@@ -57,7 +57,8 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
         )
     if len(triangles) > MAX_TRIANGLES:
         raise MeshError(
-            f"the mesh has {len(triangles)} triangles, the maximum is {MAX_TRIANGLES}; simplify it"
+            f"the mesh has {len(triangles)} triangles, but the maximum is {MAX_TRIANGLES}; "
+            "simplify the mesh"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise MeshError(
@@ -214,7 +215,7 @@ def triangle_normals(vertices: Floats, triangles: Indices) -> Floats:
 
 
 def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return unit normals (v, 3) at the vertices, which approximate those of a smooth surface.
+    """Return unit normals (v, 3) at the vertices, as if the mesh were a smooth surface.
 
     A normal is the mean of the adjacent triangles' normals, weighted by the triangles' angles at
     the vertex (Thürmer and Wüthrich, 1998).
@@ -233,7 +234,7 @@ def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
 def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
     """Return the edges (e, 2) of a closed mesh, and the angles (e,), in rad, at these edges.
 
-    The angle is that between the normals of the two triangles.
+    The angle at an edge is the angle between the normals of its two triangles.
     """
     normal, count = triangle_normals(vertices, triangles), len(triangles)
     first, second = _neighbours(triangles)
@@ -243,7 +244,10 @@ def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats
 
 
 def volume_m3(vertices: Floats, triangles: Indices) -> float:
-    """Return the volume (m^3) that a closed mesh encloses; negative for clockwise triangles."""
+    """Return the volume (m^3) that a closed mesh encloses.
+
+    The result is negative if the triangles are clockwise when seen from outside.
+    """
     corners = vertices[triangles] - vertices[triangles].mean(axis=(0, 1))
     return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
@@ -253,7 +257,7 @@ def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tup
     triangles.
 
     A long edge is halved in both adjacent triangles, so a closed mesh remains closed. Raises
-    MeshError if there are more than `MAX_TRIANGLES`.
+    MeshError if the result has more than `MAX_TRIANGLES` triangles.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
@@ -307,8 +311,8 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that intersect.
 
     A pair intersects if an edge of one triangle passes through the interior of the other triangle.
-    Edges with an end that is a vertex of the other triangle are not considered. Triangles that only
-    touch, or overlap in one plane, are not counted.
+    An edge is not considered if one of its ends is a vertex of the other triangle. Triangles that
+    only touch, or overlap in one plane, are not counted.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -335,8 +339,8 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
     centre (n, 3), radius (n,): spheres, m.
 
-    Spheres of similar size are searched together, because the search radius must be that of the
-    largest sphere.
+    Spheres of similar size are searched together, because the largest sphere determines the search
+    radius.
     """
     from scipy.spatial import cKDTree
 
@@ -385,7 +389,10 @@ def intersect_rays(
 ) -> tuple[NDArray[np.intp], Floats]:
     """Intersect lines through a point with triangles.
 
-    origin (3,): common point of the lines. rays (n, 3): directions. corners (m, 3, 3): triangles.
+    origin (3,): common point of the lines.
+    rays (n, 3): directions.
+    corners (m, 3, 3): triangles.
+
     Return the index (n,) of the triangle that each line intersects, and the barycentric weights (n,
     3) of its corners. The weights are NaN if the line misses all triangles. Source: Möller and
     Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
@@ -408,10 +415,11 @@ def intersect_rays(
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Return the barycentric coordinates (n, 3) of the points in triangles nearest to `points` (n,
-    3).
+    """Return the points of triangles that are nearest to `points` (n, 3).
 
     corners (n, 3, 3): one triangle for each point.
+
+    The result contains the barycentric coordinates (n, 3) of the nearest points.
 
     Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
     """

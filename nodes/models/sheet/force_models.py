@@ -108,8 +108,7 @@ def relative_position(
 
 MAX_RELATIVE_X = 0.98
 """The maximum relative x in closed-form models. At x = 1 (the clamp), the force would be
-infinite.
-"""
+infinite."""
 
 
 MAX_STRETCH_RATIO = 1.13
@@ -183,7 +182,7 @@ class ScaledSheetModel:
 
     a, b, c, g, p, q, r and A are fitted. A and c depend on position, fingertip radius and height.
 
-    cubic_ratio: ratio of the calibrated cubic term to that of ideal rubber.
+    cubic_ratio: ratio of the calibrated cubic term to the cubic term of ideal rubber.
     stretch_scale: ratio of the calibrated to the nominal stretch ratio, which corrects the slack
         width of the sheet.
     """

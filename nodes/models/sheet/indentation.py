@@ -2,7 +2,7 @@
 
 Finite-element solutions are precomputed over stretch, position and depth of the push. A proper
 orthogonal decomposition reduces the shapes to a dozen modes, and polynomials through Chebyshev
-points interpolate their coefficients. The computation of a shape then takes about 0.1 ms.
+points interpolate the modes' coefficients. The computation of a shape then takes about 0.1 ms.
 
 The grid moves with the finger and is densest at the finger, so the tip of the indentation is always
 at the same nodes. Solutions are computed for positions in one quadrant. Solutions for the other
@@ -25,8 +25,9 @@ HALF_CELLS = 14
 """The number of grid cells from the finger to each side of the sheet."""
 
 GRADING = 3.2
-"""The grading of the grid. The grid line at the fraction a of the cells between finger and side has
-a distance proportional to sinh(GRADING a)."""
+"""The grading of the grid. The distance of a grid line from the finger is proportional to
+sinh(GRADING a). Here a is the index of the line, counted from the finger, divided by `HALF_CELLS`.
+"""
 
 MAX_TRUNCATION_RMS_M = 2e-5
 """The maximum error (m, root mean square) due to the truncation of the modes."""
@@ -224,8 +225,7 @@ def solve_indentation(push: IndentationCase) -> Floats:
 
 
 def _decompose(samples: Floats) -> tuple[Floats, Floats]:
-    """Decompose samples (n, size) into modes (m, size), and return these with their coefficients
-    (n, m).
+    """Decompose samples (n, size) into modes (m, size); return the modes and coefficients (n, m).
 
     The number m of modes is the smallest number at which the error is below `MAX_TRUNCATION_RMS_M`.
     """

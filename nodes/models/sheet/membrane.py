@@ -8,9 +8,10 @@ Young's modulus, and C2 = 0 is a neo-Hookean material:
 
 I1 and I2 are the invariants of the Cauchy-Green tensor C = F'F, where F is the deformation
 gradient. A membrane wrinkles under compression (tension field theory: Pipkin, IMA J. Appl. Math.
-36, 1986). If the smaller principal stretch l2 is below that of uniaxial tension, l1^-1/2, the
-energy is that of uniaxial tension. If l1 is below 1 too, the energy is zero. Stress and tangent
-(its derivative with respect to the strain) are computed in the principal frame of C.
+36, 1986). In uniaxial tension, the smaller principal stretch l2 is l1^-1/2, where l1 is the larger
+one. If l2 is below this value, the energy of uniaxial tension is used. If l1 is below 1 too, the
+energy is zero. Stress and tangent (its derivative with respect to the strain) are computed in the
+principal frame of C.
 
 The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Touched nodes stick to
 the sphere. Newton's method computes each equilibrium from the previous equilibrium, with
@@ -36,7 +37,7 @@ CELLS = 32
 MIN_CELL_RADII = 0.3
 """The cell size under the finger, as a multiple of the finger's radius."""
 STEP_RADII = 0.4
-"""The maximum step of the finger's depth, as a multiple of its radius."""
+"""The maximum step of the finger's depth, as a multiple of the finger's radius."""
 PENALTY_PER_MODULUS = 2e5
 """The stiffness of the contact penalty (pressure divided by penetration), in units of E t /
 width^2.
@@ -311,8 +312,10 @@ def relaxed_energy(
     """Return the energy W per rest volume according to tension field theory, and its derivatives.
 
     large, small (n,): squared principal stretches p >= q.
-    c1, c2: material constants, Pa. The results are W (n,), its first derivatives [W_p, W_q] (2, n)
-        and its second derivatives [W_pp, W_qq, W_pq] (3, n).
+    c1, c2: material constants, Pa.
+
+    The results are W (n,), its first derivatives [W_p, W_q] (2, n) and its second derivatives
+    [W_pp, W_qq, W_pq] (3, n).
     """
     p = np.maximum(large, 1.0)
     taut = small > p**-0.5

@@ -1,6 +1,6 @@
 """Correct the closed-form force model of the sheet by a table of force ratios.
 
-A ratio is the measured or computed force divided by the force of the model.
+A ratio is the measured or computed force divided by the force of the closed-form model.
 
 The ratio varies slowly, so a coarse table is sufficient. The table is also used for fingertips of
 other radii.
@@ -34,7 +34,7 @@ class TabulatedSheetModel:
     stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes of the table. Positions are
         in one quadrant, because the sheet is symmetric.
     ratios (a, b, c, d): ratios, interpolated linearly over stretches and positions, and by monotone
-        cubics over depths. Beyond the ends of an axis, they are constant.
+        cubics over depths. Beyond the ends of an axis, the ratios are constant.
 
     Raises ValueError for axes that are not ascending, or for invalid ratios.
     """
@@ -127,7 +127,8 @@ def make_tabulated_model(
 ) -> TabulatedSheetModel:
     """Make a tabulated model from the forces that `measure` returns.
 
-    progress: function that is called with the number of finished calls of `measure`, and the total.
+    progress: function that is called with the number of finished calls of `measure` and the total
+        number of calls.
     """
     ratios = np.empty((len(stretches), len(depths_m), len(xs_m), len(ys_m)))
     total, done = len(stretches) * len(xs_m) * len(ys_m), 0

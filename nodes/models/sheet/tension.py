@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 CLAMP_FACTOR, CLAMP_FACTOR_PER_ASPECT = 1.004, 0.0735
-"""The coefficients a, b of the factor a + b height / width on the edge force of uniaxial tension.
+"""The coefficients a, b of a factor for the edge force of uniaxial tension: a + b height / width.
 
 The factor is above 1 because the clamps prevent the sheet from narrowing. The formula is within 0.3
 % of membrane finite elements for height / width from 0.5 to 1.5 and stretch ratios up to 1.12.
@@ -22,7 +22,7 @@ The factor is above 1 because the clamps prevent the sheet from narrowing. The f
 SAG_PROFILE = (0.9635, 0.23, 1.96)
 """The coefficients a, b, c of the profile a + b v^2 + c v^4 of the sag over v = y / height.
 
-The profile is the ratio of the sag to that of a sheet with uniform tension. Free edges sag more
+The profile is the ratio of the sag to the sag of a sheet with uniform tension. Free edges sag more
 than the centre. The formula is within 1 % of membrane finite elements for a square sheet with
 stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
 """
@@ -31,7 +31,7 @@ GRAVITY_M_PER_S2 = 9.81
 """The gravitational acceleration, m/s^2, along the negative y axis of the world."""
 
 PUSH_FACTOR = 0.95
-"""The factor on edge force / width that gives the stiffness of a small push.
+"""The factor by which edge force / width is multiplied to obtain the stiffness of a small push.
 
 The factor is 0.9 to 1.0 for a fingertip with a radius of 10 mm.
 """
@@ -95,7 +95,7 @@ def _clamp_factor(sheet: SlackSheet) -> float:
 
 
 def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
-    """Return the stiffness (N/m) that a small push at the sheet's centre feels.
+    """Return the stiffness (N/m) that a finger feels in a small push at the sheet's centre.
 
     edge_force: force on each clamp, N.
     width_m: distance of the clamps.
