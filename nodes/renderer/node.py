@@ -28,6 +28,9 @@ from flexsheet.nodes.renderer.output_window import OutputWindow, open_output
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
+READ_TIME_NS = 2_000_000
+"""The minimum time (ns) between the end of one frame and the start of the next frame."""
+
 
 class Renderer(Node):
     """Draw a frame for each soft-body message, at most at `rate_hz`.
@@ -160,9 +163,9 @@ class Renderer(Node):
             return
         self._drawn_ns = now_ns
         self._draw(self._frame_renderer, now_ns)
-        # If drawing takes longer than a period, leave time to read messages between frames.
-        rest_until_ns = self.clock.now_ns() + self._period_ns // 2
-        self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
+        # If drawing takes longer than a period, leave time to read the messages that have arrived.
+        earliest_ns = self.clock.now_ns() + READ_TIME_NS
+        self._due_ns = max(self._due_ns + self._period_ns, earliest_ns + self._period_ns // 4)
 
     def _draw(self, frame_renderer: FrameRenderer, begun_ns: int) -> None:
         self._since_pixels += 1
