@@ -1,7 +1,8 @@
 """Select image pairs of a board for a stereo calibration while the camera is running.
 
 A pair is accepted if the board is at rest in a new pose and if the pair improves the coverage. The
-coverage counts cells of the image, tilts and distances of the board, and the number of pairs.
+coverage is good if enough pairs show the board in each cell of the images and at each tilt and
+distance, and if there are enough pairs in total.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ NEW_POSE_PX = 12.0
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""The minimum size of a near board, and the maximum size of a far board.
+"""The minimum size of a board that counts as near, and the maximum size of one that counts as far.
 
 The size is the length of the board's diagonal divided by the length of the image's diagonal.
 """
@@ -86,7 +87,10 @@ class PairAssessment:
 
 
 class Capture:
-    """A selector of image pairs for a calibration. It counts the pairs that meet each condition."""
+    """A selector of image pairs for a calibration.
+
+    It counts the accepted pairs that meet each condition (`Bin`).
+    """
 
     def __init__(
         self,

@@ -293,16 +293,16 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate a stereo calibration by measuring image pairs that were not used.
+    """Cross-validate a stereo calibration by measuring image pairs that it does not use.
 
     The calibration is repeated with some pairs left out each time, and these pairs are measured.
-    The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
-    are similar. For chessboards, the calibration of OpenCV's tutorials is evaluated in the same
-    way, for comparison.
+    The pairs are divided into G groups. The pairs i, i+G, i+2G, ... form one group, which is left
+    out together. Consecutive pairs are in different groups, because their images are similar. For
+    chessboards, the calibration of OpenCV's tutorials is evaluated in the same way, for comparison.
 
-    leave_out: number of pairs that are left out together.
+    leave_out: number of pairs in each group.
 
-    Raises CalibrationError for unusable images, and if too few pairs remain.
+    Raises CalibrationError if images cannot be used, or if too few pairs remain.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}

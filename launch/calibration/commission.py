@@ -193,7 +193,7 @@ class Commissioning:
     apparatus: true parameters of a simulated laboratory, as given by --apparatus; None for real
         devices.
 
-    Raises CommissionError if the folder belongs to other files.
+    Raises CommissionError if the commissioning in the folder was started with other files.
     """
 
     folder: Path
@@ -417,7 +417,9 @@ def _verification_figures(state: State) -> Mapping[str, Any]:
 
 
 def format_verdict(state: State) -> list[str]:
-    """Return whether the laboratory meets all tolerances, in one line, and one line per doubt.
+    """Return a line that states whether the laboratory meets all tolerances, then the doubts.
+
+    Each doubt is one line.
 
     The result is empty before the verification.
     """
@@ -499,8 +501,9 @@ The last key that exists is used.
 def _find_measured_errors(figures: Mapping[str, Any]) -> dict[str, float]:
     """Return the measured errors by metric.
 
-    Errors of sheet and fingertip are means over the stroke, the others are measured at rest. Real
-    devices have no true errors, so only the error of the sheet that they report is known.
+    The errors of sheet and fingertip are means over the stroke. The other errors are measured at
+    rest. The true errors of real devices are unknown, so the result then contains only the sheet
+    error that the devices report.
     """
     stroke = figures.get("stroke", {})
     found = dict(figures.get("at_rest", {}).get("after", {}))
@@ -517,8 +520,8 @@ def list_doubts(
     """Return the reasons why a laboratory may exceed a tolerance; empty if there are none.
 
     figures: results of the step "verification".
-    tracking: error (mm) of the sheet during the stroke as the devices report it, and its tolerance
-        (mm).
+    tracking: error (mm) of the sheet during the stroke, as reported by the devices, and the
+        tolerance (mm) of this error.
     """
     doubts = []
     if figures.get("overloaded"):
@@ -564,10 +567,10 @@ def list_limits(state: State) -> list[str]:
 
 
 SMALL_ERROR_RATIO = 0.5
-"""The maximum ratio of the error at rest to the error in motion at which the first one is small.
+"""The maximum ratio of error at rest to error in motion for which the error at rest is small.
 
-Independent errors add in quadrature, so the error at rest then causes at most a quarter of the mean
-square.
+Independent errors add in quadrature. Below this ratio, the error at rest therefore causes at most a
+quarter of the mean square error in motion.
 """
 
 

@@ -52,7 +52,7 @@ CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
 """The standard deviation (px) of the Gaussian filter for ChArUco images.
 
-It is small, because markers are close to the corners.
+The filter is narrow, because markers are close to the corners.
 """
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
@@ -81,7 +81,7 @@ class BoardView:
 class BoardPair:
     """The board corners in the two images of one board pose.
 
-    For a ChArUco board, the images may show different corners.
+    The two images of a ChArUco board can show different corners.
     """
 
     left: BoardView

@@ -1,9 +1,9 @@
-"""Measure the delays of arms and camera.
+"""Measure the delays of the arms and the camera.
 
 The servo lag is the time by which an arm lags behind its commands. The node that controls an arm
-measures the lag from commanded and measured joint angles. It starts with the lag in the launch
-file, and its self-check reports a deviation from that value. Therefore, the measured lag is written
-to the launch file.
+measures the lag from commanded and measured joint angles. The node starts with the lag in the
+launch file, and its self-check reports a deviation from that value. Therefore, the measured lag is
+written to the launch file.
 
 The stamp offset is the time of an exposure minus its timestamp. The camera sees the marks on both
 clamps while the arms move the sheet. The motion of the marks in the images is compared with the

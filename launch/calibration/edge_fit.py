@@ -106,7 +106,7 @@ class EdgeFit:
     """The fitted parameters of an arm, with the errors of the fit.
 
     residual_rms_m: rms distance between measured and fitted positions of the marks.
-    edge_std_m: standard deviation of a mark's fitted position, all three axes together.
+    edge_std_m: standard deviation of a mark's fitted position, with all three axes combined.
     compliance_std_m_per_n: standard deviation of the compliance.
     covariance: covariance (19, 19) of the unknowns.
     """
@@ -172,7 +172,10 @@ def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[
 
 
 class _ArmModel:
-    """A model that computes the positions of an arm's marks from the unknowns (19,) of the fit."""
+    """A model that computes the positions of the marks on an arm's clamp.
+
+    The positions follow from the 19 unknowns of the fit, which the module docstring defines.
+    """
 
     def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
         self._rows = rows
@@ -191,7 +194,7 @@ class _ArmModel:
         return apply_motion(self._base, unknowns[BASE]), apply_motion(self._clamp, unknowns[EDGE])
 
     def positions(self, unknowns: Floats) -> Floats:
-        """Return the positions (n, 3), in m, of the marks in the world for given unknowns (19,)."""
+        """Return the world positions (n, 3), in m, of the n marks for given unknowns (19,)."""
         base, clamp = self.transforms(unknowns)
         found = [
             apply(

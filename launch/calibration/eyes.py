@@ -202,7 +202,7 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
 def read_alignments(path: Path) -> list[Alignment]:
     """Read alignments from a CSV file with the columns `COLUMNS`.
 
-    Raises BadInputError for an invalid file.
+    Raises BadInputError if the file is invalid.
     """
     problems: list[Problem] = []
     found = []

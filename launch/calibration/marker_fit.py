@@ -96,7 +96,7 @@ class MarkerFit:
     marker_from_pad_m: position (3,) of the marker in the finger's frame.
     covariance_m2: covariance (3, 3) of the position.
     point_offset_m: mean (3,) of the estimated errors of the touched points, in the world frame.
-    residuals_m: residual distance (touches,) of each touch.
+    residuals_m: distance (touches,) between the measured and the fitted marker of each touch.
     points, orientations: numbers of different points and orientations.
     """
 
@@ -121,8 +121,8 @@ class MarkerFit:
 def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     """Fit the marker's position on the finger by restricted maximum likelihood.
 
-    Raises MarkerFitError for too few touches or orientations, for touches that contradict each
-    other, and for an implausible or undetermined position.
+    Raises MarkerFitError if there are too few touches or orientations, or if touches contradict
+    each other. Raises it also if the position is implausible or not determined.
     """
     orientation = np.array(group_orientations([touch.world_from_finger for touch in touches]))
     orientations = len(set(orientation))

@@ -42,8 +42,8 @@ def compliance(
     """Check that the sheet can feel as soft as the virtual object of a scene.
 
     The command compares the force of the object with the rendered force, for pushes at the centre
-    up to the maximum depth of the scene. It also checks that hand and sheet cannot oscillate at the
-    given delay. The exit code is 1 if a check fails.
+    up to the maximum depth of the scene. It also checks that the hand and the sheet cannot
+    oscillate together at the given delay. The exit code is 1 if a check fails.
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene

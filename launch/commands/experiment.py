@@ -357,7 +357,8 @@ def _measure_images(
 ) -> None:
     """Run an image experiment in a graph, record it in a bag, and print the image errors.
 
-    with_table: before the experiment, wait until the table of the soft body is computed.
+    with_table: whether to wait, before the experiment, until the table of the soft body is
+        computed.
     """
     from flexsheet.launch.experiments import image
     from flexsheet.launch.experiments.maps import draw_error_maps
@@ -447,7 +448,7 @@ def gestures(
 
 
 def _print_gestures(results: list[dict[str, Any]]) -> None:
-    """Print a table of tracking errors (mm) and delays (ms), one line per gesture."""
+    """Print a table of tracking errors (mm) and delays (ms), with one line per gesture."""
     columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
     for each in results[0]["prediction"][1:]:
         columns += [f"+{each['horizon_ms']:.0f} ms rms", "lag, ms"]
@@ -464,9 +465,10 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
-    """Print the errors with which the sheet followed the finger, one line per fingertip path.
+    """Print the errors of the sheet while it followed the finger, with one line per fingertip path.
 
-    Δd and Δθ are the distance and the angle between the true sheet and the true finger in contact.
+    Δd and Δθ are the distance and the angle between the true sheet and the true finger during
+    contact.
     """
 
     columns = ["path", "in contact", "followed", "drop-outs", "true Δd, mm: mean", "95 %", "max"]

@@ -212,7 +212,8 @@ def _write_result(row: dict[str, Any], folder: Path) -> None:
 def _summarize(rows: list[dict[str, Any]], reference_pa: float) -> dict[str, Any]:
     """Return the JSON output of `flexsheet experiment jnd`.
 
-    rows: one row per participant. reference_pa: Young's modulus of the reference object.
+    rows: one row per participant.
+    reference_pa: Young's modulus of the reference object.
     """
     import numpy as np
 

@@ -32,15 +32,16 @@ PACKAGES = ("messages", "nodes", "launch")
 MAX_ENTRIES = 3
 MIN_WORD_LETTERS = 3
 MIN_SHARED_WORDS = 2
-"""The minimum number of words that a text and its explanation share in an inexact match."""
+"""The minimum number of words that a text must share with an explanation to match it inexactly."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
     """An explanation of one kind of error or note.
 
-    code: error code, or text of a note. name: name of the error class, or an empty text. phrase:
-    text that all notes of this kind contain, or an empty text.
+    code: error code, or text of a note.
+    name: name of the error class, or an empty text.
+    phrase: text that all notes of this kind contain, or an empty text.
     """
 
     code: str
@@ -100,8 +101,8 @@ def _meaning(kind: type[FlexsheetError]) -> str:
 def find_entries(text: str) -> list[Entry]:
     """Return the explanations of a code, a class name or an error text, with the best match first.
 
-    If the text contains no class name and no phrase, it is compared word by word. Explanations with
-    at least MIN_SHARED_WORDS common words match, and rare words have more weight.
+    If the text contains no class name and no phrase, it is compared word by word. An explanation
+    matches if it shares at least MIN_SHARED_WORDS words with the text. Rare words have more weight.
     """
     code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
     if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:
@@ -140,7 +141,7 @@ def explain(
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Print the meaning and the remedy of an error or a note; docs/errors.md lists all errors."""
+    """Print the meaning and the remedy of an error or a note. docs/errors.md lists all errors."""
     found = [
         {"code": one.code, "meaning": one.meaning, "remedy": one.remedy}
         for one in find_entries(message)[:MAX_ENTRIES]

@@ -60,10 +60,10 @@ SHORT_ARRAY = 36
     epilog=examples("flexsheet topic list", "flexsheet topic list --json"),
 )
 def list_topics(as_json: JsonOption = False) -> None:
-    """List all topics with message type, delivery, expected rate and description.
+    """List all topics, with their message types, deliveries, expected rates and descriptions.
 
-    The expected rate is a fixed range for health checks, or "on change" for a topic without one.
-    `flexsheet topic hz TOPIC` measures the rate in the running graph.
+    The expected rate is a fixed range that health checks use. If a topic has no expected rate, "on
+    change" is printed. `flexsheet topic hz TOPIC` measures the rate in the running graph.
     """
     from flexsheet.messages.topics import TOPICS
 
@@ -236,7 +236,7 @@ def pub(
 ) -> None:
     """Publish a message to the running graph.
 
-    The topic must allow several writers, or be listed under `external_topics` in the launch file.
+    The topic must allow several writers, or the launch file must list it under `external_topics`.
     Subscribers that connect later receive a message of a latched topic only while this command
     runs.
     """
@@ -290,7 +290,7 @@ def _by_writer(arrivals: Sequence[Arrival]) -> list[list[Arrival]]:
 
 
 def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the rate, the lost messages and the publication intervals (ms), one row per writer."""
+    """Return the rate, lost messages and publication intervals (ms), with one row per writer."""
     import numpy as np
 
     rows = []
@@ -313,7 +313,7 @@ def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the bandwidth (bytes per second) and the message sizes, one row per writer."""
+    """Return the bandwidth (bytes per second) and the message sizes, with one row per writer."""
     rows = []
     for own in _by_writer(arrivals):
         sizes = [one.size_bytes for one in own]
@@ -332,7 +332,7 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return statistics of the age (ms) of the data at arrival, one row per writer."""
+    """Return statistics of the age (ms) of the data at arrival, with one row per writer."""
     rows = []
     for own in _by_writer(arrivals):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
@@ -342,7 +342,7 @@ def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def _summarize(values: list[float]) -> dict[str, float] | None:
-    """Return the median, 99 % quantile and maximum; None if there are no values."""
+    """Return the median, 99 % quantile and maximum, or None if there are no values."""
     import numpy as np
 
     if not values:
@@ -357,7 +357,7 @@ def _summarize(values: list[float]) -> dict[str, float] | None:
 def to_plain(value: Any, *, full: bool) -> Any:
     """Convert a message or field to JSON types.
 
-    full: return long arrays completely instead of a summary.
+    full: whether long arrays are returned completely instead of as a summary.
     """
     import numpy as np
     from pydantic import BaseModel
@@ -496,7 +496,9 @@ def make_listener(
 ) -> Subscriber:
     """Create a subscriber to a topic of the running graph.
 
-    raw: pass encoded messages to the handler. Raises CommandError if no node publishes the topic.
+    raw: whether to pass encoded messages to the handler.
+
+    Raises CommandError if no node publishes the topic.
     """
     from flexsheet.launch.running.tools import make_subscriber
 

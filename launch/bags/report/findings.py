@@ -37,9 +37,9 @@ class SessionFinding:
 
 
 BRIEFLY_BUSY_FRACTION = 0.05
-"""The maximum fraction of time for which an overload counts as a possible problem only.
+"""The maximum fraction of time for which an overload is reported only as a possible problem.
 
-A longer overload, or one in which an arm stopped, is reported as a failure.
+A longer overload is reported as a failure. So is an overload during which an arm stopped.
 """
 
 CHECKED = (
