@@ -263,7 +263,7 @@ def measure_in_simulation(
     """Measure the servo lags of simulated arms and the timestamp offset of a simulated camera.
 
     calibration: stereo calibration that is used to triangulate the marks. If it is None, the
-    scene's camera model is used.
+        scene's camera model is used.
     """
     servo = measure_lags_in_simulation(scene, apparatus)
     stamp = simulate_stamp_offset(scene, apparatus, calibration=calibration, seed=seed)

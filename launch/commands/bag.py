@@ -566,8 +566,8 @@ async def _play(
 ) -> int:
     """Publish the messages of a bag to a running graph; return the exit code 0.
 
-    rate: playback speed relative to the recording. start_s: time in the bag at which playback
-    starts.
+    rate: playback speed relative to the recording.
+    start_s: time in the bag at which playback starts.
     """
     from flexsheet.launch.bags.player import play as play_bag
     from flexsheet.launch.bags.player import select_topics

@@ -63,7 +63,7 @@ def attribute_error(parts: Floats) -> Floats:
     """Return the fractions (k,) of a mean square error that k error components cause.
 
     parts: (k, n, d), error vectors that add up to the total error. The fractions add up to one. A
-    component that compensates other components has a negative fraction.
+        component that compensates other components has a negative fraction.
     """
     whole = parts.sum(axis=0)
     total = float(np.square(whole).sum())
@@ -76,7 +76,7 @@ def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
     """Return the names of the points that no other point dominates (the Pareto front).
 
     points: costs of each point; smaller is better. A point dominates another if one of its costs is
-    lower and none is higher. Costs with overlapping confidence intervals are considered equal.
+        lower and none is higher. Costs with overlapping confidence intervals are considered equal.
     """
     return [
         name

@@ -89,8 +89,9 @@ def measure_family(
     """Measure all selected trials of a method family, and report the progress.
 
     A trial is a combination of a method and a case. Trials are requested one by one and measured
-    immediately, because the family may then release their data. select: function that returns
-    whether a trial is measured.
+    immediately, because the family may then release their data.
+
+    select: function that returns whether a trial is measured.
     """
     family.prepare(scene, _make_reporter("computing the reference:", progress))
     points: list[Point] = []

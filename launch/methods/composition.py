@@ -55,9 +55,11 @@ DELAYS = frozenset({SystemMetric.TO_ARM, SystemMetric.TO_LIGHT})
 class StageOption:
     """A method that can be chosen for a stage.
 
-    cores: processor time per second. spreads, biases: random and signed 95 % errors or delays (ms)
-    that the method adds to system metrics. given: methods of other stages for which these values
-    were measured. outside: fraction of the scene's cases that are out of the method's stated range.
+    cores: processor time per second.
+    spreads, biases: random and signed 95 % errors or delays (ms) that the method adds to system
+        metrics.
+    given: methods of other stages for which these values were measured.
+    outside: fraction of the scene's cases that are out of the method's stated range.
     """
 
     method: str
@@ -177,8 +179,8 @@ class GraphRun:
     """A run of one combination of methods in the graph.
 
     predicted, measured: 95 % values by metric; a metric that the run does not measure has its
-    predicted value in both. exceeded: ratio of value to tolerance of each metric that exceeds its
-    tolerance.
+        predicted value in both.
+    exceeded: ratio of value to tolerance of each metric that exceeds its tolerance.
     """
 
     methods: Mapping[str, str]
@@ -192,8 +194,8 @@ class GraphRun:
 class Composition:
     """The result of the search for a combination of methods.
 
-    chosen: accepted combination, or the combination that exceeds the tolerances least. runs: all
-    runs.
+    chosen: accepted combination, or the combination that exceeds the tolerances least.
+    runs: all runs.
     """
 
     chosen: Combination
@@ -281,8 +283,10 @@ def compose(
 
     If no combination can meet a tolerance, one near the smallest attainable value is chosen.
 
-    run_graph: function that runs a combination and returns its metrics. margin: fraction of each
-    tolerance that predictions must leave. Raises ExperimentError if there is no combination.
+    run_graph: function that runs a combination and returns its metrics.
+    margin: fraction of each tolerance that predictions must leave.
+
+    Raises ExperimentError if there is no combination.
     """
     combinations = list_combinations(stages)
     if not combinations:
@@ -373,8 +377,8 @@ def _find_cheaper(
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
     """Return the cheapest combination with predicted metrics within the attainable limits.
 
-    limits: wanted limits, before they are raised to attainable values. If no combination is
-    within all limits, return the combination with the smallest excess.
+    limits: wanted limits, before they are raised to attainable values. If no combination is within
+        all limits, return the combination with the smallest excess.
     """
     predicted = [predict(one, unexplained) for one in left]
     attainable = _relax(limits, predicted)
@@ -394,7 +398,7 @@ def _relax(limits: Figures, found: Sequence[Figures]) -> Figures:
     """Raise the limits that are below the attainable values, and return the limits.
 
     found: metrics of the combinations. A returned limit is at least the smallest value found,
-    multiplied by the ratio up to which two values are considered equal.
+        multiplied by the ratio up to which two values are considered equal.
     """
     return {
         metric: max(

@@ -66,8 +66,9 @@ COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
 class SceneTrials:
     """The trials of one scene.
 
-    trials: description of each trial for the sweep, by name. places: block and configuration of
-    each trial. common: settings that all trials share.
+    trials: description of each trial for the sweep, by name.
+    places: block and configuration of each trial.
+    common: settings that all trials share.
     """
 
     file: Path
@@ -106,8 +107,9 @@ def plan_trials(
 ) -> SceneTrials:
     """Return the trials of one scene: first the errors, then the blocks in random order.
 
-    blocks: number of repetitions. seconds: duration of each stroke. apparatuses: number of random
-    apparatuses.
+    blocks: number of repetitions.
+    seconds: duration of each stroke.
+    apparatuses: number of random apparatuses.
     """
     scene = load_scene(scene_file)
     return plan_configurations(
@@ -190,8 +192,9 @@ def run_system_chart(
 ) -> dict[str, Any]:
     """Measure the configurations for all scenes, and return the result of `chart system --json`.
 
-    blocks: number of repetitions per scene. seconds: duration of each stroke. apparatuses: number
-    of random apparatuses.
+    blocks: number of repetitions per scene.
+    seconds: duration of each stroke.
+    apparatuses: number of random apparatuses.
     """
     points: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
@@ -295,9 +298,9 @@ def summarize_configuration(
 ) -> dict[str, Any]:
     """Summarize one configuration as one point of the chart.
 
-    rows: processor use and latencies by configuration and block. errors, random: errors with the
-    nominal apparatus and with each random apparatus. Ratios to the control are computed from all
-    blocks in which both configurations have a row.
+    rows: processor use and latencies by configuration and block.
+    errors, random: errors with the nominal apparatus and with each random apparatus. Ratios to the
+        control are computed from all blocks in which both configurations have a row.
     """
     own, control = rows[name], rows.get(CONTROL, {})
     blocks = sorted(own)

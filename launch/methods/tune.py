@@ -64,10 +64,10 @@ class Tunable:
     """A method family, of which a scene can choose one method.
 
     families: locations `module:NAME` of the `Family` objects that form the method family, in the
-    order of measurement. Later objects take minutes to prepare, and are measured only if no earlier
-    method is sufficient. settings: value to write into the scene, by the method's name in the
-    chart. required_key: dotted key that a scene must have; otherwise no node uses the method
-    family.
+        order of measurement. Later objects take minutes to prepare, and are measured only if no
+        earlier method is sufficient.
+    settings: value to write into the scene, by the method's name in the chart.
+    required_key: dotted key that a scene must have; otherwise no node uses the method family.
     """
 
     name: str
@@ -148,8 +148,9 @@ TWO_PASS_NAMES = {
 def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
     """Return the tunable method families that the scene uses, in the order of tuning.
 
-    names: names of the method families; if empty, all are returned. Raises UnknownTunableError for
-    an unknown name, and for a family that the scene does not use.
+    names: names of the method families; if empty, all are returned.
+
+    Raises UnknownTunableError for an unknown name, and for a family that the scene does not use.
     """
     known = [one.name for one in TUNABLES]
     for name in names:
@@ -171,10 +172,12 @@ def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
 class MethodEvaluation:
     """The evaluation of one method over a scene's working range.
 
-    median_s, slowest_s: median and maximum of the time per call over the cases. error: maximum
-    error within the method's stated range, found at `worst_case`; infinite if no reference is
-    known. outside: cases outside the method's stated range. wrong: cases without a reference, or
-    with an error above the tolerance minus its margin. points: measurements of all cases.
+    median_s, slowest_s: median and maximum of the time per call over the cases.
+    error: maximum error within the method's stated range, found at `worst_case`; infinite if no
+        reference is known.
+    outside: cases outside the method's stated range.
+    wrong: cases without a reference, or with an error above the tolerance minus its margin.
+    points: measurements of all cases.
     """
 
     method: str
@@ -202,7 +205,7 @@ class Choice:
     """The chosen method of a method family, with the evaluations of all measured methods.
 
     composed: whether the method was chosen for the errors of the whole system. In this case, the
-    tolerance of the method family alone does not determine the choice.
+        tolerance of the method family alone does not determine the choice.
     """
 
     family: str
@@ -305,7 +308,8 @@ def evaluate_methods(
 ) -> list[MethodEvaluation]:
     """Evaluate the methods in `settings` over all measured cases in the scene's working range.
 
-    tolerance: maximum error. margin: fraction of the tolerance that must remain.
+    tolerance: maximum error.
+    margin: fraction of the tolerance that must remain.
     """
     allowed, evaluations = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
@@ -363,7 +367,7 @@ def tune(
     """Measure the methods of all given families in order, and choose one method per family.
 
     margin: fraction of each tolerance that is reserved. Errors of method families that do not
-    support the scene's shape, mesh or sheet are raised.
+        support the scene's shape, mesh or sheet are raised.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
@@ -454,9 +458,11 @@ def insert_choices(
     """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
     All other text is unchanged, including the methods of other method families. If `methods` is a
-    mapping on one line, it is expanded to several lines. today, machine, commit: values for the
-    generated comment. unmet: system metrics that exceed their tolerance, and stages out of their
-    range, for the comment.
+    mapping on one line, it is expanded to several lines.
+
+    today, machine, commit: values for the generated comment.
+    unmet: system metrics that exceed their tolerance, and stages out of their range, for the
+        comment.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
@@ -500,10 +506,10 @@ def _make_line(choice: Choice, indent: str) -> str:
 class _Block:
     """The block `methods` of a scene file, with the indices of its lines.
 
-    start: first line, including the generated comment above it. end: line after the block. If the
-    file has no such block, both are the end of the file. header: the line `methods:` if it can be
-    reused, otherwise empty. parts: key and lines of each method family, in order; comments have an
-    empty key.
+    start: first line, including the generated comment above it.
+    end: line after the block. If the file has no such block, both are the end of the file.
+    header: the line `methods:` if it can be reused, otherwise empty.
+    parts: key and lines of each method family, in order; comments have an empty key.
     """
 
     start: int
@@ -623,9 +629,12 @@ def write_choices(
 ) -> None:
     """Write the choices atomically into a scene file or into a copy of it.
 
-    source: scene file. target: file to write; if it is a symbolic link, the file that it points to
-    is written. unmet: as in `insert_choices`. Raises BadInputError if other parts of the scene
-    would change, or if the target cannot be written.
+    source: scene file.
+    target: file to write; if it is a symbolic link, the file that it points to is written.
+    unmet: as in `insert_choices`.
+
+    Raises BadInputError if other parts of the scene would change, or if the target cannot be
+    written.
     """
     text = insert_choices(
         relocate_paths(_read(source), source, target),

@@ -204,9 +204,11 @@ def tune_system(
 ) -> tuple[Composition, list[Choice]]:
     """Find the cheapest combination of measured methods that meets the tolerances of the system.
 
-    Returns the search result, and the choices for the scene. runs: number of runs per combination;
-    the largest 95 % value of these runs is used. Raises ExperimentError if all runs of a
-    combination fail.
+    Returns the search result, and the choices for the scene.
+
+    runs: number of runs per combination; the largest 95 % value of these runs is used.
+
+    Raises ExperimentError if all runs of a combination fail.
     """
     scene = load_scene(scene_file)
     progress("measuring the tracking with the noise of each marker method")

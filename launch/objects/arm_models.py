@@ -75,8 +75,9 @@ def load_arm_models(document: Document) -> None:
 def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
     """Read the chain of six rotary joints between two links of a URDF file.
 
-    start_rad: joint angles of an arm that reaches towards the sheet. Raises UrdfError if the file
-    does not describe such a chain.
+    start_rad: joint angles of an arm that reaches towards the sheet.
+
+    Raises UrdfError if the file does not describe such a chain.
     """
     joints = {joint.child: joint for joint in _load_joints(path)}
     chain: list[Any] = []

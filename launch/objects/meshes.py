@@ -100,9 +100,11 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     """Read a closed mesh from a file, convert its unit to metres, and repair the mesh.
 
     Repairs merge duplicate vertices, remove degenerate and duplicate triangles and unused vertices,
-    and orient the triangles outwards. `Mesh.origin` lists the repairs. smoothing_m: smoothing
-    length of the surface; None for the default. Raises MeshError for holes and other faults that
-    cannot be repaired.
+    and orient the triangles outwards. `Mesh.origin` lists the repairs.
+
+    smoothing_m: smoothing length of the surface; None for the default.
+
+    Raises MeshError for holes and other faults that cannot be repaired.
     """
     vertices, triangles, repairs = _repair(_load_trimesh(path), metres_per_unit)
     extent_m = float(np.ptp(vertices, axis=0).max())
@@ -168,7 +170,8 @@ def _load_trimesh(path: Path) -> Any:
 def _check_arrays(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
     """Raise MeshError if arrays are invalid although trimesh has accepted them.
 
-    vertices: (v, 3). faces: (t, 3).
+    vertices: (v, 3).
+    faces: (t, 3).
     """
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
         raise MeshError("the faces are not triangles of 3D points; triangulate the mesh")

@@ -73,7 +73,7 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
     """Read an apparatus from a file, or sample a random apparatus from a text such as "seed:7".
 
     scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
-    sampled relative to the scene before commissioning, in the world frame of the camera.
+        sampled relative to the scene before commissioning, in the world frame of the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.

@@ -91,7 +91,9 @@ Key = tuple[str | int, ...]
 class Problem:
     """An error in an input file.
 
-    where: location, such as "file:line". key: path of the value. what: description of the error.
+    where: location, such as "file:line".
+    key: path of the value.
+    what: description of the error.
     remedy: what the user should do.
     """
 
@@ -187,7 +189,8 @@ class Document:
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
         """Return a problem that is located at `key` in this document.
 
-        what: description of the error. remedy: what the user should do.
+        what: description of the error.
+        remedy: what the user should do.
         """
         return Problem(self.where(key), key, what, remedy)
 

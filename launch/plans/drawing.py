@@ -38,8 +38,9 @@ STYLE = """
 class Arrow:
     """An arrow for the topics from one node to another, or for a connection to a device.
 
-    path: points of the SVG polyline, px. label_at: position of the label, px. wire: label of a
-    device connection; empty for topics.
+    path: points of the SVG polyline, px.
+    label_at: position of the label, px.
+    wire: label of a device connection; empty for topics.
     """
 
     writer: str
@@ -55,8 +56,8 @@ class Arrow:
 class GraphDrawing:
     """The geometry (px) of the drawing of a graph.
 
-    hosts: left, top, width and height of each host's frame. boxes, devices: centres of the boxes of
-    nodes and devices, by name.
+    hosts: left, top, width and height of each host's frame.
+    boxes, devices: centres of the boxes of nodes and devices, by name.
     """
 
     title: str
@@ -182,6 +183,7 @@ def _connect(boxes: dict[str, Position], writer: str, reader: str, topics: Seque
     """Return the arrow between two nodes.
 
     The arrow is straight if the reader is on the right; otherwise it passes below both boxes.
+
     boxes: centres of the nodes, px.
     """
     (x1, y1), (x2, y2) = boxes[writer], boxes[reader]

@@ -154,6 +154,7 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     """Read a launch file, and merge it with the files that it extends.
 
     extending: files that extend this file, directly or indirectly, to detect circular references.
+
     Raises BadInputError if a file is invalid.
     """
     document = read_document(path)
@@ -196,7 +197,9 @@ def apply_scene(document: Document, scene: Path) -> None:
 def apply_setting(document: Document, setting: str) -> None:
     """Apply one value of the option --set to a launch file.
 
-    setting: NODE.PARAMETER=VALUE or scene=FILE. Raises BadInputError if the setting is invalid.
+    setting: NODE.PARAMETER=VALUE or scene=FILE.
+
+    Raises BadInputError if the setting is invalid.
     """
     origin = f"--set {setting}"
     target, equals, text = setting.partition("=")

@@ -46,7 +46,8 @@ def omit_unneeded(
     Ports that a node does not use with its parameters and this scene are disconnected. The scene is
     ignored if a node of the graph publishes scenes, because a later scene may need more nodes.
 
-    needed: topics that command-line tools read. external: topics that command-line tools write.
+    needed: topics that command-line tools read.
+    external: topics that command-line tools write.
     """
     fixed = scene
     if any(topic.name == "scene" for entry in entries for _, topic in entry.topics("output")):

@@ -81,10 +81,12 @@ def load_graph(
     """Read, check and resolve a launch file.
 
     settings: texts "node.parameter=value" with a YAML value, or "scene=FILE", which override the
-    file. record: bag file to write, which overrides the recorder's setting in the launch file.
+        file.
+    record: bag file to write, which overrides the recorder's setting in the launch file.
     console: whether to add a console and a paused recorder, unless the file contains them.
     apparatus: true parameters of the simulated hardware, as a file or "seed:N"; None uses the
-    scene's values. needed: topics that the caller reads; their writers are started.
+        scene's values.
+    needed: topics that the caller reads; their writers are started.
     without: parts of the display that are omitted.
 
     Raises BadInputError with all errors of the file.

@@ -51,7 +51,8 @@ These plans do not list calibrations.
 class ArmingMode(StrEnum):
     """The values of the parameter `arming` of the arm bridge.
 
-    auto: the arm moves without a command. manual: the arm moves only after a command of the user.
+    auto: the arm moves without a command.
+    manual: the arm moves only after a command of the user.
     """
 
     MANUAL = "manual"
@@ -254,7 +255,8 @@ class ResolvedGraph(StrictModel):
     ) -> list[ResolvedProcess]:
         """Return the processes on `host`, in the order of their first nodes.
 
-        host: name of a host; None for all hosts. without: names of nodes that are not started.
+        host: name of a host; None for all hosts.
+        without: names of nodes that are not started.
         """
         members: dict[str, list[ResolvedNode]] = {}
         for node in self.nodes_on(host):

@@ -43,8 +43,9 @@ Other nodes have their parameters below the key `parameters`.
 class NodeEntry:
     """A node of a launch file during its resolution.
 
-    type, parameters: class and parameters of the node; None until they are resolved. ports:
-    connected ports with their topics. unconnected: unconnected ports with the topics of their type.
+    type, parameters: class and parameters of the node; None until they are resolved.
+    ports: connected ports with their topics.
+    unconnected: unconnected ports with the topics of their type.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -65,8 +66,9 @@ class NodeEntry:
     def disconnect_optional(self, written: Container[str]) -> None:
         """Disconnect optional inputs without a writer.
 
-        Inputs that the launch file names explicitly stay connected. written: names of the topics
-        that have a writer.
+        Inputs that the launch file names explicitly stay connected.
+
+        written: names of the topics that have a writer.
         """
         if self.type is None:
             return
@@ -302,7 +304,7 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
     """Return all parameters of a node as JSON values, including defaults.
 
     resolve_paths: whether to make paths absolute; paths in the launch file are relative to its
-    folder.
+        folder.
     """
     assert entry.parameters is not None  # otherwise the load has failed
     values = entry.parameters.model_dump(mode="json")
@@ -318,7 +320,9 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
     """Return the JSON form of a parameter value with absolute instead of relative paths.
 
-    value: parameter value. dumped: its JSON form. base: base folder of relative paths.
+    value: parameter value.
+    dumped: its JSON form.
+    base: base folder of relative paths.
     """
     if isinstance(value, Path):
         return _absolute(value, base)

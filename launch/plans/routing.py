@@ -38,7 +38,7 @@ def list_writers(
     """Return the (writer, host) pairs of each topic, in the order of the launch file.
 
     has_scene, has_apparatus: whether the launcher publishes a scene and an apparatus. Topics with
-    more writers than allowed are reported to `document`.
+        more writers than allowed are reported to `document`.
     """
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
@@ -133,9 +133,9 @@ def make_endpoints(
 ) -> dict[str, tuple[Writer, ...]]:
     """Return the writers of each topic with their network endpoints.
 
-    writers: (writer, host) pairs by topic. addresses: IP addresses by host. The endpoints are ipc
-    for connections on one host, and tcp for connections between hosts. If there is only one host,
-    topics have no tcp endpoint.
+    writers: (writer, host) pairs by topic.
+    addresses: IP addresses by host. The endpoints are ipc for connections on one host, and tcp for
+        connections between hosts. If there is only one host, topics have no tcp endpoint.
     """
     far = sorted(
         (host, writer, topic)

@@ -34,9 +34,11 @@ from flexsheet.messages.topics import TOPICS, find_topic
 class Ros2Bridge:
     """A bridge between one running graph and one participant of the middleware DDS.
 
-    topics: flexsheet topics to publish. accept: topics to accept from ROS nodes (keys of `INPUTS`).
-    noise_m: standard deviation of external fingertip positions. published, accepted: numbers of
-    messages by topic. on_problem: function that is called with the text of an error.
+    topics: flexsheet topics to publish.
+    accept: topics to accept from ROS nodes (keys of `INPUTS`).
+    noise_m: standard deviation of external fingertip positions.
+    published, accepted: numbers of messages by topic.
+    on_problem: function that is called with the text of an error.
     """
 
     def __init__(

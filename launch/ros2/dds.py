@@ -117,8 +117,10 @@ def _describe(ros_type: str) -> Any:
 class RosParticipant:
     """A participant of a DDS domain that publishes and subscribes to ROS topics.
 
-    domain: number of the domain, equal to the ROS_DOMAIN_ID of the other participants. interface:
-    name of the network interface. Raises Ros2Error if the participant cannot be created.
+    domain: number of the domain, equal to the ROS_DOMAIN_ID of the other participants.
+    interface: name of the network interface.
+
+    Raises Ros2Error if the participant cannot be created.
     """
 
     def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
@@ -175,7 +177,7 @@ class RosParticipant:
         """Subscribe to a topic.
 
         on_message: function that is called in the running event loop with the CDR bytes of each
-        message.
+            message.
         """
         from cyclonedds.core import InstanceState as State
         from cyclonedds.core import ReadCondition, SampleState, ViewState

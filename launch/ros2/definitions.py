@@ -162,8 +162,9 @@ def _describe_sequence(
 ) -> tuple[str, Callable[[Any, Make], Any]]:
     """Return the ROS type of a sequence, and a function that converts its values.
 
-    item: annotation of an element. suffix: array part of the ROS type, such as "[]". split:
-    function that returns the elements of a value. None becomes an empty sequence.
+    item: annotation of an element.
+    suffix: array part of the ROS type, such as "[]".
+    split: function that returns the elements of a value. None becomes an empty sequence.
     """
     item_type, convert = _describe(item)
     if "[" in item_type:  # ROS does not support sequences of sequences.

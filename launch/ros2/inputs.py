@@ -54,8 +54,8 @@ INPUTS = {
 class ExternalInputs:
     """A converter of external messages that rejects implausible messages.
 
-    noise_m: standard deviation of external fingertip positions. rejected: numbers of rejected
-    messages by reason.
+    noise_m: standard deviation of external fingertip positions.
+    rejected: numbers of rejected messages by reason.
     """
 
     noise_m: float
@@ -74,8 +74,10 @@ class ExternalInputs:
         """Return a converted ROS message and its source timestamp (ns) on the local clock.
 
         decode: function that returns the ROS message, or raises an exception for malformed bytes.
-        now_ns: current time of the local clock. unix_ns: current time since 1970, ns. Returns None
-        if the message is rejected.
+        now_ns: current time of the local clock.
+        unix_ns: current time since 1970, ns.
+
+        Returns None if the message is rejected.
         """
         try:
             if self.scene is None:

@@ -131,7 +131,8 @@ def load_ros_types() -> RosTypes:
 class Source:
     """The data that the conversion of a message needs in addition to the message.
 
-    topic: topic of the message. at_ns: source timestamp of the message, ns since 1970.
+    topic: topic of the message.
+    at_ns: source timestamp of the message, ns since 1970.
     scene, skin: latest messages of the same graph; None before the first message.
     flanges: latest flange poses (4, 4) by side.
     """
@@ -153,9 +154,11 @@ class Source:
 class View:
     """A ROS topic with a standard type that represents some fields of a message.
 
-    message: type of the message. fields: names of the fields. name: name of the ROS topic without
-    the first slash, in which {topic} represents the flexsheet topic. make: function that converts a
-    message, or returns None if there is nothing to publish.
+    message: type of the message.
+    fields: names of the fields.
+    name: name of the ROS topic without the first slash, in which {topic} represents the flexsheet
+        topic.
+    make: function that converts a message, or returns None if there is nothing to publish.
     """
 
     message: type[Message]
@@ -170,7 +173,8 @@ class View:
 class RosTopic:
     """A ROS 2 topic.
 
-    name: begins with a slash. latched: whether later readers receive the last message.
+    name: begins with a slash.
+    latched: whether later readers receive the last message.
     """
 
     name: str
@@ -400,7 +404,10 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
 def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
     """Return the corners (4, 3), in m, of a flat sheet between both clamped edges.
 
-    The order is lower left, upper left, lower right, upper right. flanges: poses (4, 4) by side.
+    The order is lower left, upper left, lower right, upper right.
+
+    flanges: poses (4, 4) by side.
+
     Returns None if the scene or an arm is unknown.
     """
     if scene is None or len(flanges) < 2:
@@ -551,8 +558,8 @@ class Converter:
     ) -> Iterator[tuple[RosTopic, Any]]:
         """Convert a message, and yield pairs of a ROS topic and a ROS message.
 
-        shift_ns: difference between the time since 1970 and the clock of the header. wanted:
-        function that returns whether messages of a ROS topic are needed.
+        shift_ns: difference between the time since 1970 and the clock of the header.
+        wanted: function that returns whether messages of a ROS topic are needed.
         """
         match message:
             case Scene():

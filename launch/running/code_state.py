@@ -24,7 +24,7 @@ def read_git_state(directory: Path) -> str:
     """Return a JSON text with the git commit of the code, and whether files have changed.
 
     directory: root of the repository. The keys are `commit` and `changed`. Outside of a git
-    repository, `commit` is the value of COMMIT_VARIABLE or null, and `changed` is null.
+        repository, `commit` is the value of COMMIT_VARIABLE or null, and `changed` is null.
     """
     listed = _git(
         directory, "status", "--porcelain", "-z", "--untracked-files=all", "--", *SOURCE_PATHS

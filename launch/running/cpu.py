@@ -42,8 +42,10 @@ class Waits:
 class CpuWatch:
     """A monitor of waiting times and processor times over the last WINDOW_S.
 
-    Call `update` once a second. proc: folder of the kernel's counters. now_s: function that returns
-    the time (s) of the monotonic clock.
+    Call `update` once a second.
+
+    proc: folder of the kernel's counters.
+    now_s: function that returns the time (s) of the monotonic clock.
     """
 
     def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -63,10 +65,10 @@ class CpuWatch:
         The waiting time is measured over the last WINDOW_S. Returns None if no waiting time is
         known.
 
-        watched: process ids of the measured nodes by node name. named:
-        process ids by node name, of the nodes that are reported by name; None: `watched`.
+        watched: process ids of the measured nodes by node name.
+        named: process ids by node name, of the nodes that are reported by name; None: `watched`.
         measure_programs: whether to list the running programs even if the computer is not
-        overloaded.
+            overloaded.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -104,8 +106,9 @@ class CpuWatch:
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
         """Return the programs that have used the most processor time since the last call.
 
-        Return no programs if the last call was more than WINDOW_S ago. named: process ids by node
-        name.
+        Return no programs if the last call was more than WINDOW_S ago.
+
+        named: process ids by node name.
         """
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}

@@ -71,8 +71,10 @@ class ForkServer:
     """The launcher's connection to a fork server. The constructor starts the server.
 
     node_types: types of the nodes. Modules of types outside this package are not imported, since
-    they may start threads. config_files: files of all processes that may be started. lifeline: file
-    descriptor that the nodes inherit. log: file for the server's own output.
+        they may start threads.
+    config_files: files of all processes that may be started.
+    lifeline: file descriptor that the nodes inherit.
+    log: file for the server's own output.
     """
 
     def __init__(
@@ -133,7 +135,8 @@ class ForkServer:
         """Start a process with nodes; return None if this is not possible, and close the fork
         server.
 
-        config_file: configuration of the process. output: descriptor for standard output and error.
+        config_file: configuration of the process.
+        output: descriptor for standard output and error.
         ready: descriptor that the configuration names; it has the same number in the new process.
         """
         changed = {
@@ -176,7 +179,9 @@ def serve(socket_fd: int) -> str:
     """Import the modules of the nodes, then fork a process for each request of the launcher.
 
     The function returns only in the forked processes; its result is the path of their
-    configuration. socket_fd: descriptor of the socket to the launcher.
+    configuration.
+
+    socket_fd: descriptor of the socket to the launcher.
     """
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(os.environ[PARENT_VARIABLE]):
@@ -230,7 +235,9 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
     """Fork a process, and make the launcher its parent.
 
     Returns True in the new process, and False in the fork server. The new process ends if the
-    launcher has not received its process id. descriptors: files that the process inherits.
+    launcher has not received its process id.
+
+    descriptors: files that the process inherits.
     """
     pid_read, pid_write = os.pipe()
     go_read, go_write = os.pipe()

@@ -62,8 +62,10 @@ Pids = Callable[[], dict[str, int]]
 class HostAgent:
     """A part of the launcher that publishes the status of its host and latches e-stops.
 
-    The agent works between the calls of `start` and `close`. code: git commit that `HostStatus`
-    reports. pids: function that returns the process ids of the running nodes by node name.
+    The agent works between the calls of `start` and `close`.
+
+    code: git commit that `HostStatus` reports.
+    pids: function that returns the process ids of the running nodes by node name.
     """
 
     def __init__(

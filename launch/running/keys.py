@@ -42,8 +42,9 @@ def secret_file(host: str) -> Path:
 def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
     """Write the key ring files of a run, load them, and return the key rings by host.
 
-    host: host of the key ring file; None for all hosts. Raises BadInputError if a key is missing
-    or invalid.
+    host: host of the key ring file; None for all hosts.
+
+    Raises BadInputError if a key is missing or invalid.
     """
     rings = {}
     problems = []

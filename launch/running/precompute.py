@@ -73,8 +73,9 @@ def precompute_deflection_shapes(
 def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
     """Return a function (done, total) that reports the progress and the remaining time in steps.
 
-    If `total` changes, or `done` decreases, the reports start again. what: name of the computation
-    in the reports.
+    If `total` changes, or `done` decreases, the reports start again.
+
+    what: name of the computation in the reports.
     """
     from flexsheet.nodes.cache import EtaEstimator
 
@@ -114,9 +115,11 @@ def precompute_soft_body(
 ) -> Path:
     """Return the file with the nonlinear table of a soft body; compute it if it is missing.
 
-    skin_spacing_m: spacing of the nodes at the surface. scheduler: address of a dask.distributed
-    scheduler; None computes on this computer. Raises NoSoftBodyError if the scheduler cannot be
-    used, the body cannot be meshed, or memory is insufficient.
+    skin_spacing_m: spacing of the nodes at the surface.
+    scheduler: address of a dask.distributed scheduler; None computes on this computer.
+
+    Raises NoSoftBodyError if the scheduler cannot be used, the body cannot be meshed, or memory is
+    insufficient.
     """
     from flexsheet.nodes.cache import EtaEstimator
     from flexsheet.nodes.fem_solver import body, precompute_table

@@ -13,8 +13,9 @@ RUNNABLE = "R"
 class ProcessorTime:
     """The kernel counters of the main thread of a process since its start.
 
-    run_s: time on a processor core. wait_s: time that the thread waited for a core, until the
-    thread last ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
+    run_s: time on a processor core.
+    wait_s: time that the thread waited for a core, until the thread last ran.
+    state: letter in /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float

@@ -48,10 +48,12 @@ class StopPath(StrEnum):
 class StopOutcome(StrEnum):
     """The outcome of an attempt to stop.
 
-    confirmed: the receiver has engaged the stop. silent: the stop was sent but not confirmed.
-    absent: no process listens. published: the stop was sent on the topic, without confirmation.
-    refused: the stop was not sent, because another tool uses the endpoint of the topic. killed: the
-    process was killed.
+    confirmed: the receiver has engaged the stop.
+    silent: the stop was sent but not confirmed.
+    absent: no process listens.
+    published: the stop was sent on the topic, without confirmation.
+    refused: the stop was not sent, because another tool uses the endpoint of the topic.
+    killed: the process was killed.
     """
 
     CONFIRMED = "confirmed"
@@ -66,8 +68,10 @@ class StopOutcome(StrEnum):
 class StopAttempt:
     """An attempt to stop the arms.
 
-    path: means of sending. receiver: name of the receiver. outcome: result. after_ms: time from the
-    first request to the outcome.
+    path: means of sending.
+    receiver: name of the receiver.
+    outcome: result.
+    after_ms: time from the first request to the outcome.
     """
 
     path: StopPath

@@ -306,9 +306,10 @@ def _start_python(
 class RunningGraph:
     """A supervisor of the processes that run the nodes of a graph.
 
-    host: host of the nodes to start; None starts all nodes on this computer. without: names of
-    nodes that are not started. report: function that is called with (node, line) for every log
-    line. The folder `run.logs` also contains all lines.
+    host: host of the nodes to start; None starts all nodes on this computer.
+    without: names of nodes that are not started.
+    report: function that is called with (node, line) for every log line. The folder `run.logs` also
+        contains all lines.
     """
 
     def __init__(

@@ -64,8 +64,8 @@ def make_subscriber(
 ) -> Subscriber:
     """Return a subscriber to all writers of a topic in a running graph; the caller must start it.
 
-    raw: whether `on_message` receives undecoded messages. on_problem: function that is called with
-    the text of an error.
+    raw: whether `on_message` receives undecoded messages.
+    on_problem: function that is called with the text of an error.
     """
     definition = find_topic(topic)
     return Subscriber(
@@ -87,6 +87,7 @@ async def read_topic(
     """Yield the messages of a topic of a running graph with their headers as they arrive.
 
     count: number of messages; None for no limit. If the caller is slow, messages wait in a queue.
+
     Raises KeyError for a topic that does not exist.
     """
     # Import the module here, so that commands that do not call this function start faster.

@@ -73,8 +73,8 @@ class JointLimit:
 class Joint:
     """A joint between two links.
 
-    parent_from_child: pose (4, 4) of the child at joint angle zero. limit: axis and range of a
-    revolute joint; None for a fixed joint.
+    parent_from_child: pose (4, 4) of the child at joint angle zero.
+    limit: axis and range of a revolute joint; None for a fixed joint.
     """
 
     name: str
@@ -203,7 +203,10 @@ def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]
 def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:
     """Return boxes for the housing and the lens of a device that faces +z.
 
-    The centre of the lens is the origin. body_m: size of the housing. lens_m: width of the lens.
+    The centre of the lens is the origin.
+
+    body_m: size of the housing.
+    lens_m: width of the lens.
     """
     depth_m = body_m[2]
     return (

@@ -47,7 +47,8 @@ def draw_mesh(
 ) -> Any:
     """Make a Foxglove scene update that draws a triangle mesh.
 
-    vertices: (n, 3), m. triangles: (k, 3), vertex indices.
+    vertices: (n, 3), m.
+    triangles: (k, 3), vertex indices.
     """
     surface = fg.TriangleListPrimitive(
         pose=make_pose(np.eye(4)),

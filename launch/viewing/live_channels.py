@@ -78,8 +78,9 @@ JPEG_QUALITY = 80
 class Pace(Enum):
     """The maximum rate of a channel.
 
-    NUMBERS, IMAGES: the configured rate of numbers or images. EACH: not limited. STATIC: when the
-    scene changes, and once per second for viewers that connect later.
+    NUMBERS, IMAGES: the configured rate of numbers or images.
+    EACH: not limited.
+    STATIC: when the scene changes, and once per second for viewers that connect later.
     """
 
     NUMBERS = "numbers"
@@ -128,10 +129,12 @@ class LiveState:
 class LiveChannel:
     """A channel that viewers can display.
 
-    topics: topics that the channel needs in addition to the scene. triggers: topics that cause the
-    channel to send a message. make: function (state, received message, timestamp) that returns a
-    message of the channel, or None if there is nothing to send. kind: Foxglove type of the
-    messages; empty for JSON. schema: JSON Schema of JSON messages.
+    topics: topics that the channel needs in addition to the scene.
+    triggers: topics that cause the channel to send a message.
+    make: function (state, received message, timestamp) that returns a message of the channel, or
+        None if there is nothing to send.
+    kind: Foxglove type of the messages; empty for JSON.
+    schema: JSON Schema of JSON messages.
     """
 
     name: str

@@ -72,8 +72,9 @@ class ReadOnlyParameters(ServerListener):
 class LiveServer:
     """A server that sends the data of one running graph to viewers in a running event loop.
 
-    rate_hz, image_rate_hz: maximum rates per channel, of numbers and of images and meshes. port:
-    TCP port; 0 selects a free port. on_problem: function that is called with the text of an error.
+    rate_hz, image_rate_hz: maximum rates per channel, of numbers and of images and meshes.
+    port: TCP port; 0 selects a free port.
+    on_problem: function that is called with the text of an error.
     """
 
     def __init__(
@@ -202,7 +203,8 @@ class LiveServer:
     ) -> None:
         """Send a message on a channel if the channel has viewers and its period has elapsed.
 
-        now_ns: present time. source_ns: timestamp of the message.
+        now_ns: present time.
+        source_ns: timestamp of the message.
         """
         sink, key = self._sinks[channel.name], (channel.name, topic)
         if now_ns < self._due_ns.get(key, 0) or not sink.has_sinks():
