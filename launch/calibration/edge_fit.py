@@ -38,7 +38,11 @@ from flexsheet.nodes.models.rigid import (
 from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
-"""The indices of the unknowns: base pose error, joint offsets, edge pose error, compliance."""
+"""The indices of the unknowns in the vector (19,) of the fit.
+
+The unknowns are the pose error of the base, the joint offsets, the pose error of the edge, and the
+compliance of the flange.
+"""
 
 PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
 """The standard deviations (19,) of the prior distribution of the unknowns, in rad, m and m/N."""

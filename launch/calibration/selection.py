@@ -41,7 +41,10 @@ CORNER_RATIO = 6.0
 
 CORNER_ROUNDS = 2
 MAX_OUTLIER_FRACTION = 0.15
-"""The maximum fraction of outliers among the corners of a pair; other pairs are not used."""
+"""The maximum fraction of outliers among the corners of a pair.
+
+Pairs with a larger fraction are not used.
+"""
 
 REPEAT_PX = 1.0
 """The maximum median distance (px) of corners between two pairs that have the same board pose."""

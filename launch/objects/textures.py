@@ -22,7 +22,10 @@ APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_SIDE_PX = 2048
-"""The maximum width and height of a texture image, in pixels; the projector has fewer pixels."""
+"""The maximum width and height of a texture image, in pixels.
+
+The projected image has fewer pixels.
+"""
 
 
 class TextureError(FlexsheetError, ValueError):

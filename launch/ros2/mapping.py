@@ -117,7 +117,7 @@ class RosTypes:
         )
 
     def duration(self) -> Any:
-        """Make a duration of zero."""
+        """Make a ROS duration of zero."""
         return self.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
 
 
@@ -133,7 +133,8 @@ class Source:
 
     topic: topic of the message.
     at_ns: source timestamp of the message, ns since 1970.
-    scene, skin: latest messages of the same graph; None before the first message.
+    scene, skin: latest messages with the scene and the surface of the soft body; None before the
+        first message.
     flanges: latest flange poses (4, 4) by side.
     """
 
@@ -156,8 +157,8 @@ class View:
 
     message: type of the message.
     fields: names of the fields.
-    name: name of the ROS topic without the first slash, in which {topic} represents the flexsheet
-        topic.
+    name: name of the ROS topic, except for the first slash. In the name, {topic} represents the
+        flexsheet topic.
     make: function that converts a message, or returns None if there is nothing to publish.
     """
 
@@ -173,8 +174,8 @@ class View:
 class RosTopic:
     """A ROS 2 topic.
 
-    name: begins with a slash.
-    latched: whether later readers receive the last message.
+    name: name of the topic, which begins with a slash.
+    latched: whether readers that connect later receive the last message.
     """
 
     name: str
@@ -294,7 +295,7 @@ FORCE_DIRECTIONS = {
     "left_edge": (1.0, 0.0, 0.0),
     "right_edge": (-1.0, 0.0, 0.0),
 }
-"""The direction (3,) of a positive measured force in the sheet frame, by axis of the sensor."""
+"""The direction (3,), in the sheet's frame, of a positive measured force, by sensor axis."""
 
 
 def _measured_force(force: Force, source: Source) -> Any | None:

@@ -1,9 +1,9 @@
 """Measure how long nodes wait for a processor core, and which programs use the cores.
 
-For each thread, Linux counts the time in which it was ready to run but did not get a core
+For each thread, Linux counts the time in which the thread was ready to run but did not get a core
 (`/proc/PID/schedstat`). The main thread of a node runs its event loop, so this wait delays the
 whole node. System-wide counters (load, /proc/pressure) do not show whether nodes are delayed. They
-include programs of high niceness, which are expected to wait.
+also count programs of high niceness, which are expected to wait.
 """
 
 from __future__ import annotations
@@ -18,12 +18,14 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""The maximum fraction of time that a node waits for a core on a computer without overload."""
+"""The maximum fraction of time that a node waits for a core if the computer is not overloaded."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
-"""The minimum niceness of nodes whose waiting time is ignored, because they are expected to
-wait."""
+"""The minimum niceness of nodes whose waiting time is ignored.
+
+These nodes are expected to wait.
+"""
 
 MAX_PROGRAMS = 3
 MIN_CORES = 0.1
@@ -66,7 +68,8 @@ class CpuWatch:
         known.
 
         watched: process ids of the measured nodes by node name.
-        named: process ids by node name, of the nodes that are reported by name; None: `watched`.
+        named: process ids, by node name, of the nodes that are reported by name; None: the nodes in
+            `watched`.
         measure_programs: whether to list the running programs even if the computer is not
             overloaded.
         """
@@ -95,8 +98,7 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return the total waiting time (s) of the main thread of a process; None if it is
-        unknown."""
+        """Return the total waiting time (s) of the main thread of a process, or None if unknown."""
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:

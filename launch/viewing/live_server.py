@@ -45,7 +45,7 @@ UPDATE_S = 0.1
 STATIC_S = 1.0
 TIME_S = 1.0 / 30.0
 ALWAYS_READ = frozenset({"scene", "status"})
-"""The topics that the server always reads, because they contain scene and parameters."""
+"""The topics that the server always reads, because they contain the scene and the parameters."""
 URDF_PARAMETER = "/robot_description"
 
 
@@ -72,8 +72,9 @@ class ReadOnlyParameters(ServerListener):
 class LiveServer:
     """A server that sends the data of one running graph to viewers in a running event loop.
 
-    rate_hz, image_rate_hz: maximum rates per channel, of numbers and of images and meshes.
-    port: TCP port; 0 selects a free port.
+    rate_hz, image_rate_hz: maximum rate per channel of numbers, and maximum rate per channel of
+        images and meshes.
+    port: TCP port; 0: a free port is selected.
     on_problem: function that is called with the text of an error.
     """
 
