@@ -231,7 +231,7 @@ class Commissioning:
             return State.model_validate_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, ValidationError) as error:
             raise CommissionError(
-                f"{path}: this is not a valid state of a commissioning: {error}; use a new folder"
+                f"{path}: not a valid commissioning state file: {error}; use a new folder"
             ) from error
 
     @property

@@ -464,7 +464,8 @@ def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Lens
             best, min_score = found, score
     if best is None:
         raise HandEyeError(
-            "these poses have no initial solution; rotate the flange more, about two axes"
+            "no initial solution was found for these poses; rotate the flange by larger angles, "
+            "about at least two non-parallel axes"
         )
     return best
 
@@ -592,7 +593,8 @@ def _fit_unknowns(
             step = np.asarray(np.linalg.solve(matrix, side), np.float64)
         except np.linalg.LinAlgError as error:
             raise HandEyeError(
-                "the poses do not determine the base; rotate the flange more, about two axes"
+                "the poses do not determine the base; rotate the flange by larger angles, about "
+                "at least two non-parallel axes"
             ) from error
         unknowns = unknowns.apply_step(step)
         if np.abs(step).max() < CONVERGED_STEP:

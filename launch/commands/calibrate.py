@@ -39,11 +39,19 @@ app = typer.Typer(
 
 LeftOption = Annotated[
     str,
-    typer.Option(metavar="GLOB", help="File pattern of the left images, paired by sorted name."),
+    typer.Option(
+        metavar="GLOB",
+        help="File pattern of the left images. Left and right images are paired in the order of "
+        "their names.",
+    ),
 ]
 RightOption = Annotated[
     str,
-    typer.Option(metavar="GLOB", help="File pattern of the right images, paired by sorted name."),
+    typer.Option(
+        metavar="GLOB",
+        help="File pattern of the right images. Left and right images are paired in the order of "
+        "their names.",
+    ),
 ]
 BoardOption = Annotated[
     str,

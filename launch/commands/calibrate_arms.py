@@ -91,7 +91,7 @@ def arms(
         Path | None,
         typer.Option(
             "--write-scene",
-            help="Copy of the scene to write, with the measured base poses.",
+            help="Output file: a copy of the scene with the measured base poses.",
             callback=options.check_folder,
         ),
     ] = None,

@@ -44,7 +44,10 @@ POSES = 24
 )
 def edges(
     *,
-    output: Annotated[Path, options.result_file("Copy of the scene file with the measured arms.")],
+    output: Annotated[
+        Path,
+        options.result_file("Output file: a copy of the scene with the measured arm parameters."),
+    ],
     rows: Annotated[
         Path | None,
         typer.Option(

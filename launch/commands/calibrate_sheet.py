@@ -47,7 +47,7 @@ def sheet(
         typer.Option(
             metavar="CSV",
             help="CSV file of measured pushes; columns: depth_mm, force_n, edge_distance_mm or "
-            "stretch_ratio; optional ones: docs/sheet.md.",
+            "stretch_ratio. docs/sheet.md lists optional columns.",
         ),
     ] = None,
     bag: Annotated[

@@ -96,7 +96,7 @@ def commission(
         typer.Option(
             "--step",
             metavar="STEP",
-            help="Step to run again, with all later steps; repeat the option for several.",
+            help="Step to run again, with all later steps; repeat the option for several steps.",
         ),
     ] = None,
     skipped: Annotated[

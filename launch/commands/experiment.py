@@ -107,8 +107,9 @@ def stroke(
     without: Annotated[
         list[Feature] | None,
         typer.Option(
-            help="Part of the display to omit: the projected image or the rendered force. Without "
-            "the image, frame latencies are null. Not with several strokes or variants."
+            help="Part of the display to omit: the projected image or the rendered force. If the "
+            "image is omitted, frame latencies are null. The option cannot be combined with "
+            "several strokes or variants."
         ),
     ] = None,
     switches: Annotated[
@@ -118,7 +119,7 @@ def stroke(
             max=1000,
             help="Number of switches of the projected image between white and black after the "
             "stroke, for the latency of the projector. The bag then contains the images of the "
-            "camera. Not with several strokes.",
+            "camera. The option cannot be combined with several strokes.",
         ),
     ] = 0,
     output: options.ResultFolderOption = None,
@@ -284,8 +285,8 @@ def compliance(
         bool,
         typer.Option(
             "--complete-table",
-            help="Wait for the complete table of the soft body; otherwise the pushes begin with "
-            "the coarse table, if the complete one is not in the cache.",
+            help="Wait for the complete table of the soft body. Otherwise, the pushes begin with "
+            "the coarse table if the complete table is not in the cache.",
         ),
     ] = False,
     output: options.ResultFolderOption = None,
@@ -555,7 +556,7 @@ def stability(
         bool,
         typer.Option(
             "--graph",
-            help="With --gestures: run the graph, with the hand of the apparatus. Without it, the "
+            help="With --gestures: run the graph, with the hand of the apparatus. By default, the "
             "gestures run in simulated time.",
         ),
     ] = False,

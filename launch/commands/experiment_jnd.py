@@ -68,8 +68,8 @@ def jnd(
         typer.Option(
             min=1,
             max=1000,
-            help="With --simulated-participant: number of participants; the first has the seed "
-            "--seed, the next ones the following seeds. Seeds 0-99 are for development.",
+            help="With --simulated-participant: number of participants. The first has the seed of "
+            "--seed, and the others have the following seeds. Seeds 0-99 are for development.",
         ),
     ] = 1,
     launch_file: options.LaunchOption = options.DEMO,

@@ -103,8 +103,8 @@ ApparatusOption = Annotated[
         "--apparatus",
         metavar="FILE|seed:N",
         help="File with the true parameters of the simulated hardware, or a random sample such as "
-        "seed:7. seed:7,paper has older equipment, and seed:7,calibrated only the errors that "
-        "remain after calibrations. Default: the parameters of the scene.",
+        "seed:7. seed:7,paper simulates older equipment. seed:7,calibrated contains only the "
+        "errors that remain after calibrations. Default: the parameters of the scene.",
     ),
 ]
 TwinApparatusOption = Annotated[

@@ -119,7 +119,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     check_mesh(vertices, triangles)
     crossings = count_intersections(vertices, triangles)
     if crossings > MAX_CUTTING_RATIO * len(triangles):
-        raise MeshError(f"{crossings} pairs of triangles intersect in the mesh; repair it")
+        raise MeshError(f"{crossings} pairs of triangles intersect; repair the mesh")
     if crossings:
         repairs.append(f"{crossings} intersecting pairs of triangles bridged")
     if smoothing_m is None:
@@ -156,8 +156,8 @@ def _load_trimesh(path: Path) -> Any:
         ) from error
     if size > MAX_BYTES:
         raise MeshError(
-            f"the file has {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are allowed; decimate "
-            "the mesh"
+            f"the file has {size >> 20} MiB, but at most {MAX_BYTES >> 20} MiB are allowed; "
+            "decimate the mesh"
         )
     # Import only when needed, because only scenes with a mesh use trimesh.
     import trimesh
@@ -204,7 +204,7 @@ def _repair(
         raise MeshError("the mesh contains no triangles; export a triangle mesh")
     if len(mesh.faces) > 2 * MAX_TRIANGLES:
         raise MeshError(
-            f"the mesh has {len(mesh.faces)} triangles, at most {MAX_TRIANGLES} are allowed; "
+            f"the mesh has {len(mesh.faces)} triangles, but at most {MAX_TRIANGLES} are allowed; "
             "decimate the mesh"
         )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)

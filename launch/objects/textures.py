@@ -78,7 +78,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if max(image.shape) > MAX_SIDE_PX:
         height, width = image.shape[:2]
         raise TextureError(
-            f"the image has {width}x{height} pixels, at most {MAX_SIDE_PX} per side are allowed; "
-            "reduce its size"
+            f"the image has {width}x{height} pixels, but at most {MAX_SIDE_PX} per side are "
+            "allowed; reduce its size"
         )
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

@@ -59,8 +59,8 @@ class HostSpec(StrictModel):
     )
     may_reset_estop: bool | None = Field(
         default=None,
-        description="whether nodes of the host may reset an emergency stop; null: only nodes of "
-        "the main host may",
+        description="whether nodes of the host are allowed to reset an emergency stop; null: only "
+        "nodes of the main host are allowed",
     )
 
 
