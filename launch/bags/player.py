@@ -40,7 +40,7 @@ class TopicSelection:
 def select_topics(
     recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
 ) -> TopicSelection:
-    """Select the topics of a bag that command-line tools may publish in a graph.
+    """Select the topics of a bag that command-line tools are allowed to publish in a graph.
 
     recorded: topics of the bag.
     wanted: topics to play; empty for all topics.

@@ -2,7 +2,7 @@
 
 The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row of the table is
 a pose of the arm at rest. It contains six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) and
-the names of two image files (`left`, `right`). Instead of images, a row may contain the pose of the
+the names of two image files (`left`, `right`). Instead of images, a row can contain the pose of the
 board in the left camera's frame. The columns are then `board_x_m`, `board_y_m`, `board_z_m`
 (position of the first corner), and `board_rx_rad`, `board_ry_rad`, `board_rz_rad` (rotation
 vector).
@@ -335,10 +335,10 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 class SimulatedArm:
     """A simulated arm that holds no sheet, and whose base pose and joint angles have errors.
 
-    If an apparatus (true hardware parameters) is given, the arm has its base pose and joint
-    offsets, and each joint rests at a random angle within its backlash. Otherwise, the base
-    deviates at random from the scene, and each joint has random errors with the standard deviation
-    SIMULATED_JOINT_RAD.
+    If an apparatus (true hardware parameters) is given, the arm has the base pose and the joint
+    offsets of the apparatus. Each joint then rests at a random angle within its backlash.
+    Otherwise, the base deviates at random from the scene, and each joint has random errors with the
+    standard deviation SIMULATED_JOINT_RAD.
     """
 
     def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:

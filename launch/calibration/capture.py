@@ -1,8 +1,8 @@
 """Select image pairs of a board for a stereo calibration while the camera is running.
 
 A pair is accepted if the board is at rest in a new pose and if the pair improves the coverage. The
-coverage is good if enough pairs show the board in each cell of the images and at each tilt and
-distance, and if there are enough pairs in total.
+coverage is complete if there are enough pairs in total. There must also be enough pairs with the
+board in each cell of the images, at each tilt, and at each distance.
 """
 
 from __future__ import annotations

@@ -559,8 +559,8 @@ def list_doubts(
 def list_limits(state: State) -> list[str]:
     """Return texts that state what limits the accuracy, with the most important one first.
 
-    The first text names the metric that is nearest to its tolerance, if the laboratory is verified.
-    The others name the uncertainties of the steps.
+    If the laboratory is verified, the first text names the metric that is nearest to its tolerance.
+    The other texts name the uncertainties of the steps.
     """
     nearest = _describe_nearest_metric(_verification_figures(state))
     return ([] if nearest is None else [nearest]) + _rank_uncertainties(state)

@@ -131,7 +131,9 @@ def describe(board: Board) -> str:
 
 
 def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's ChArUco board. Raises CalibrationError for an unsuitable marker dictionary."""
+    """Make OpenCV's ChArUco board. Raises CalibrationError if the marker size or dictionary is
+    unsuitable.
+    """
     name = board.dictionary or ""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if board.marker_m is None or number is None:
@@ -274,7 +276,7 @@ def _refine_corners(
 def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
     """Renumber the corners (n, 2) of the right image to match the left image.
 
-    A detector may start at either end of the board, or at any corner of a square board. Because the
+    A detector can start at either end of the board, or at any corner of a square board. Because the
     cameras of a stereo rig are nearly parallel, the matching numbering has the same directions in
     both images.
     """

@@ -162,8 +162,8 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
 
     guess: initial projector of the fit.
 
-    Raises ProjectorError if there are too few points or poses, if the depth range or the coverage
-    is too small, or if the residuals are too large.
+    Raises ProjectorError if there are too few points or poses, or if their depth range or coverage
+    is too small. Raises it also if the residuals are too large.
     """
     inliers = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _measure_depth_range(points, guess)
@@ -314,8 +314,8 @@ def fit_keystone(
     """Fit a projector to the pixels that light the corners of a rectangle on the imaginary screen.
 
     Many projectors light four given corners exactly, because the corners determine only a
-    homography. The result is the one of these projectors that is nearest to `guess`. It has the
-    distortion of `guess`.
+    homography. Of these projectors, the result is the projector that is nearest to `guess`. Its
+    lens distortion is equal to the distortion of `guess`.
 
     corners_px: projector pixels (4, 2) of bottom left, bottom right, top right, top left, as the
         user sees them.

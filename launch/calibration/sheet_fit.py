@@ -183,9 +183,10 @@ def fit_sheet_model(
 ) -> SheetModelFit:
     """Fit the parameters of the sheet's force model to measured pushes.
 
-    The parameters are modulus times thickness, unstretched width, and the ratio of the cubic term
-    of the force to that of ideal rubber. The weight of the Mooney term is optional. The
-    least-squares fit is robust: it first uses a soft-L1 loss, and then omits outliers.
+    The parameters are the product of modulus and thickness, the unstretched width, and the cubic
+    ratio. The cubic ratio is the cubic term of the force divided by the cubic term of ideal rubber.
+    The weight of the Mooney term is optional. The least-squares fit is robust: it first uses a
+    soft-L1 loss, and then omits outliers.
 
     nominal: initial rubber of the fit.
     with_mooney: whether the weight of the Mooney term is fitted.
@@ -338,7 +339,7 @@ def tabulate_pushes(
     """Make a table of the ratio of measured to modelled force, from the used pushes.
 
     The axes of the table are stretch, depth, and the distances of the push from the sheet's centre
-    along x and y. Pushes must exist at every combination of stretch, x and y, but their depths may
+    along x and y. Pushes must exist at every combination of stretch, x and y. Their depths can
     differ. The ratios are interpolated at depths that all combinations cover.
 
     used: mask (n,) of the pushes to use.

@@ -31,8 +31,9 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 JUST_TAUT_TENSION = 2e-6
 """The residual tension of slack rubber, divided by the shear modulus, for an almost taut sheet.
 
-The simulator in a running graph uses a value a hundred times as large, because its sheet may hang.
-That tension would triple the force of a small push into a sheet that is barely slack.
+The simulator in a running graph uses a value that is a hundred times as large, because its sheet
+can hang slack. That tension would triple the force of a small push into a sheet that is barely
+slack.
 """
 
 PUSHED_CELLS, UNTOUCHED_CELLS = 24, 16

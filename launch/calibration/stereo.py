@@ -77,10 +77,10 @@ def calibrate_stereo(
 ) -> CalibrationResult:
     """Calibrate a stereo camera from pairs of images of a board.
 
-    A pair is excluded if it does not show the board, if it repeats the pose of another pair, or if
-    it contradicts the other pairs (`compute_misfits`). Corners with residuals above six standard
-    deviations are also excluded. A pair is excluded if its residual exceeds both half a pixel and
-    three times the median. The result contains the reason for each excluded pair.
+    A pair is excluded if it does not show the board or repeats the pose of another pair. It is also
+    excluded if it contradicts the other pairs (`compute_misfits`). Corners with residuals above six
+    standard deviations are also excluded. A pair is excluded if its residual exceeds both half a
+    pixel and three times the median. The result contains the reason for each excluded pair.
 
     working_distance_m: distance to which the uncertainty applies; None: median distance of the
         boards.

@@ -85,8 +85,8 @@ def stop(
     This command does not replace the hard-wired e-stop. Without --run, it stops the arms of all
     graphs of this user on this computer.
 
-    The exit code is 0 if a launcher or an arm bridge (node that controls an arm) confirms the stop,
-    or if both arms report it.
+    The exit code is 0 if the stop is confirmed by a launcher or by a node that controls an arm. It
+    is also 0 if both arms report the stop.
     """
     from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms

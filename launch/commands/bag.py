@@ -314,8 +314,8 @@ def verify(
     """Run a node twice on its recorded inputs, and compare the outputs.
 
     The exit code is 1 if the two runs differ, if the node fails, or if the node cannot be replayed.
-    The exit code is 3 if the two runs are equal but differ from the recorded outputs, for example
-    because the node reads the system clock.
+    The exit code is 3 if the two runs are equal but differ from the recorded outputs. A possible
+    reason is that the node reads the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 

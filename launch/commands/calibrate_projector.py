@@ -101,8 +101,8 @@ def projector(
     """Calibrate the pose and the lens of the projector, and write the result into a scene.
 
     The data are stereo images of Gray-code patterns on the sheet in three or more poses
-    (--pictures), or four corners that you have set manually (--corners). With --twin, the images
-    are simulated.
+    (--pictures). Alternatively, they are four corners that you have set manually (--corners). With
+    --twin, the images are simulated.
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import calibrate_projector, measure_points

@@ -195,7 +195,7 @@ def _parse_step(option: str, text: str) -> StepName:
 def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
     """Return the texts by step from the values STEP=TEXT of a command-line option.
 
-    Raises CommandError for an unknown step or an empty text.
+    Raises CommandError if a step is unknown or a text is empty.
     """
     pairs = {}
     for one in given or ():

@@ -155,7 +155,7 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """Check in a thread whether sheet and hand may oscillate, if the planner runs on `host`."""
+    """If the planner runs on `host`, check in a thread whether sheet and hand may oscillate."""
     if any(
         issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
     ):

@@ -194,7 +194,8 @@ def delay(
     """Measure the age of a topic's data when a message arrives at this command.
 
     The age is the time since the source timestamp, for instance since the exposure of an image.
-    Messages with timestamps of another computer are ignored, because its clock may differ.
+    Messages with timestamps of another computer are ignored, because the clock of that computer can
+    differ.
     """
     from flexsheet.messages.clock import SystemClock
 

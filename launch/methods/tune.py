@@ -2,8 +2,8 @@
 
 A method family contains interchangeable methods for one task. The methods are measured on this
 computer over the scene's working range. A method is sufficient if its stated range contains the
-working range, and if its maximum error is smaller than the scene's tolerance minus a margin. If no
-method is sufficient, the best insufficient method is chosen and reported.
+working range. Its maximum error must also be smaller than the scene's tolerance minus a margin. If
+no method is sufficient, the best insufficient method is chosen and reported.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Read the arm models of a scene file that refers to URDF files.
 
-A scene file may give the model of an arm as
+A scene file can give the model of an arm as
 
 model: {urdf: ur5e.urdf, base: base_link, tip: tool0, start_rad: [...]}
 

@@ -1,6 +1,6 @@
 """Read, check and repair the mesh file of a scene.
 
-A scene file may give an object as
+A scene file can give an object as
 
 geometry: {shape: mesh_file, file: liver.obj, metres_per_unit: 0.01}
 
@@ -35,7 +35,7 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""The shape names that scene files may contain.
+"""The names of shapes that scene files can contain.
 
 A scene file refers to a mesh by a file name, and does not contain its arrays.
 """

@@ -1,6 +1,6 @@
 """Read and check the texture image of a scene's object.
 
-In a scene file, the object may have
+In a scene file, the object can have
 
 appearance: {texture: image, image_file: marble.png}
 

@@ -44,8 +44,8 @@ def omit_unneeded(
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
     """Return the nodes that are started, and the omitted nodes with the reasons for their omission.
 
-    A port is disconnected if the node does not use it with its parameters and this scene. The scene
-    is ignored if a node of the graph publishes scenes, because a later scene may need more nodes.
+    A port is disconnected if the node does not use it with its parameters and this scene. If a node
+    of the graph publishes scenes, the scene is ignored, because a later scene can need more nodes.
 
     needed: topics that command-line tools read.
     external: topics that command-line tools write.

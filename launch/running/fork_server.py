@@ -76,8 +76,8 @@ class ForkedProcess:
 class ForkServer:
     """The launcher's connection to a fork server. The constructor starts the server.
 
-    node_types: types of the nodes. Modules of types outside this package are not imported, since
-        they may start threads.
+    node_types: types of the nodes. If a type is defined outside this package, its module is not
+        imported, because the module could start threads.
     config_files: files of all processes that may be started.
     lifeline: file descriptor that the nodes inherit.
     log: file for the server's own output.

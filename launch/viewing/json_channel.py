@@ -1,7 +1,7 @@
 """Convert messages to JSON that viewers can list and plot.
 
 Foxglove and Lichtblick reject nested arrays and fields that have no type. An array therefore
-becomes one list, row by row, and a field with the value None is omitted.
+becomes one list, row by row. A field is omitted if its value is None.
 """
 
 from __future__ import annotations

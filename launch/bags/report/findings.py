@@ -20,7 +20,7 @@ MAX_LIMIT_RATIO = 1.0
 """The maximum ratio of a value to its limit that is not reported as a problem."""
 
 ROUNDING = 1.02
-"""The factor by which measured values may exceed their limits because of rounding."""
+"""The factor by which measured values can exceed their limits because of rounding."""
 
 
 @dataclass(frozen=True, slots=True)
