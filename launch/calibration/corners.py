@@ -131,8 +131,9 @@ def describe(board: Board) -> str:
 
 
 def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's ChArUco board. Raises CalibrationError if the marker size or dictionary is
-    unsuitable.
+    """Make OpenCV's ChArUco board.
+
+    Raises CalibrationError if the marker size or the dictionary is unsuitable.
     """
     name = board.dictionary or ""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None

@@ -1,5 +1,4 @@
-"""`flexsheet experiment jnd`: measure the smallest stiffness difference that a participant
-feels."""
+"""`flexsheet experiment jnd`: measure the smallest stiffness difference that a person feels."""
 
 from __future__ import annotations
 

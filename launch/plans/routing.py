@@ -1,5 +1,4 @@
-"""Determine the writers of each topic, connect the inputs of nodes, and assign network
-endpoints."""
+"""Determine the writers of topics, connect the inputs of nodes, and assign network endpoints."""
 
 from __future__ import annotations
 

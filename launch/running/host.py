@@ -176,8 +176,7 @@ class HostAgent:
             publisher.close()
 
     def _stop(self, reason: str) -> None:
-        """Engage an e-stop that the command `flexsheet arms stop` has sent through the local
-        socket."""
+        """Engage an e-stop that `flexsheet arms stop` has sent through the local socket."""
         writer = tools_on(self._host)
         self._on_problem(f"e-stop of {writer}, {NodeNote.ESTOP_KEPT.phrase}")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())

@@ -84,8 +84,10 @@ GROUP_REAPS, GROUP_REAP_S = 20, 0.1
 """The number of attempts to reap the child processes of a node, and the time (s) between them."""
 
 Report = Callable[[str, str], None]
-"""A function that is called with (node, line) for each log line; the launcher has the name
-"launch"."""
+"""A function that is called with (node, line) for each log line.
+
+For log lines of the launcher, `node` is "launch".
+"""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
@@ -206,8 +208,7 @@ class Child:
                 on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Request Python's fault handler to write the call stacks to the log, then kill the
-        process."""
+        """Let Python's fault handler write the call stacks to the log, then kill the process."""
         self._reports = False
         self.signal(signal.SIGABRT)
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
@@ -629,8 +630,10 @@ class RunningGraph:
         )
 
     async def _watch_keys(self) -> None:
-        """Detect key changes in the launch file and the user's key files, and send them to the
-        processes."""
+        """Detect changed keys in the launch file and the user's key files.
+
+        The changes are sent to the processes.
+        """
         watch = KeyWatch(self.plan, self.run, self._rings)
         reported = ""
         while True:
@@ -828,8 +831,10 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the scene file as JSON, for the nodes that publish
-        scenes."""
+        """Write all scenes in the folder of the scene file as JSON.
+
+        Nodes that publish scenes read these files.
+        """
         folder.mkdir()
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
