@@ -63,8 +63,9 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 }
 """The modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
-The first module defines the typer app. Its variable is `app`, or the name after the colon. The
-other modules add commands to the app when they are imported.
+The first module defines the typer app. The app is the variable `app` of this module, or the
+variable that is named after the colon. The other modules add commands to the app when they are
+imported.
 """
 
 
@@ -200,7 +201,7 @@ def error_text(error: Exception) -> str:
 
 
 def explained_by(error: Exception) -> str | None:
-    """Return the command line that explains an error, or None if its text contains the remedy."""
+    """Return the command line that explains an error, or None if the text contains the remedy."""
     if not isinstance(error, FlexsheetError) or isinstance(error, CommandError):
         return None
     if error.exit_code == BAD_INPUT or isinstance(error.__cause__, FileNotFoundError):

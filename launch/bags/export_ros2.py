@@ -2,7 +2,7 @@
 
 A bag of ROS 2 is an MCAP file with messages in CDR encoding. `flexsheet.launch.ros2.mapping`
 defines the topics and types. Timestamps count from 1970 if the bag contains the wall-clock time of
-its start. Otherwise they count from the start of the recording computer.
+its start. Otherwise, they count from the time when the recording computer was started.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 The node is built from the resolved launch file in the bag. Its status messages contain the order
 and time of the messages that it handled (`messages.types.Status.execution_log`). The replay follows
 this log, so it skips the same messages as the live node. Bags of earlier versions contain no log.
-For them, the replay passes all recorded inputs to the node in the order of recording, and calls
-timers when they are due.
+If a bag contains no log, the replay passes all recorded inputs to the node in the order of
+recording, and calls timers when they are due.
 
 The replay runs twice, and both runs must give the same bytes. The fields of the outputs are
 compared with the recorded fields, with a tolerance.
@@ -504,8 +504,8 @@ def compute_field_differences(
 ) -> dict[str, float]:
     """Return the differences between two messages as a mapping from field names to differences.
 
-    Fields that are equal are omitted. For fields with numbers, the value is the maximum absolute
-    difference. For other fields, it is 1.
+    Fields that are equal are omitted. If a field contains numbers, its difference is the maximum
+    absolute difference. Otherwise, it is 1.
     """
     found: dict[str, float] = {}
     for name in type(one).model_fields:

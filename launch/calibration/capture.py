@@ -59,8 +59,9 @@ class Bin:
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
     """Return the required number of image pairs for each condition, for a total of `pairs`.
 
-    Cells at the outer edges of the two images are excluded, because only one camera sees them at
-    most distances. These are the left edge of the left image and the right edge of the right image.
+    Cells at the outer edges of the two images are excluded, because only one camera sees the board
+    there at most distances. These are the left edge of the left image and the right edge of the
+    right image.
     """
     count = max(1, round(0.1 * pairs))
     required = {Bin("pairs", ""): pairs}
@@ -219,7 +220,7 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
     effect.
 
     pose: pose of the board (6,) in the left camera's frame.
-    middle: centre of the board (3,), in m, in its own frame.
+    middle: centre of the board (3,), in m, in the board's frame.
     """
     transform = pose_transform(pose)
     centre = transform[:3, :3] @ middle + transform[:3, 3]

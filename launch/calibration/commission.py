@@ -1,9 +1,9 @@
 """Run all calibrations of a laboratory in sequence, and store their results in one folder.
 
 This is called commissioning (`flexsheet commission`). The folder contains the state
-(`commission.json`), the calibration files, a scene and a launch file that use them, and a report.
-Each step starts from the scene with the results of all earlier steps. If a step is repeated, all
-later steps must therefore be run again.
+(`commission.json`), the calibration files, and a report. It also contains a scene and a launch file
+that use the calibration files. Each step starts from the scene with the results of all earlier
+steps. If a step is repeated, all later steps must therefore be run again.
 """
 
 from __future__ import annotations

@@ -28,15 +28,15 @@ last step.
 SCALE = 2
 """The factor by which images are enlarged before corners are refined.
 
-OpenCV's refinement interpolates linearly between pixels. Without enlargement, this would shift
-corners by 0.015 px and change the measured size of the board by 3e-5. Also, more markers are
-detected in enlarged images.
+OpenCV's refinement interpolates linearly between pixels. If images were not enlarged, this would
+shift corners by 0.015 px and change the measured size of the board by 0.003 %. Also, more markers
+are detected in enlarged images.
 """
 
 MIN_CORNERS = 8
 """The minimum number of ChArUco corners in an image.
 
-With fewer corners, the board's pose is inaccurate.
+If there are fewer corners, the board's pose is inaccurate.
 """
 
 MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
@@ -162,8 +162,8 @@ def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
 def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
     """Make a ChArUco detector that accepts a corner next to only one marker.
 
-    With OpenCV's default of two markers, a quarter of the corners would be lost, mostly at the
-    image's edge. Later steps correct or exclude wrong corners.
+    If two markers were required, as by default in OpenCV, a quarter of the corners would be lost,
+    mostly at the image's edge. Later steps correct or exclude wrong corners.
     """
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1

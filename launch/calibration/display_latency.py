@@ -77,7 +77,8 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
     wrongly. The result is the mean and the standard deviation of the posterior distribution with a
     uniform prior.
 
-    Raises DisplayLatencyError if there are too few switches, or if the images do not show them.
+    Raises DisplayLatencyError if there are too few switches, or if the images do not show the
+    switches.
     """
     switches = len({one.switched_s for one in images})
     if switches < MIN_SWITCHES:

@@ -46,7 +46,7 @@ MIN_POSES = 6
 MIN_ROTATION_RAD = float(np.radians(5.0))
 """The minimum rms rotation (rad) of the flange about each of two axes.
 
-With smaller rotations, the poses do not determine all unknowns.
+If the rotations are smaller, the poses do not determine all unknowns.
 """
 
 RANDOM_STARTS = 60
@@ -548,7 +548,7 @@ class _NoiseModel:
     def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
         """Return the information matrices (n, 6, 6) of the flange motions of n poses.
 
-        They include the errors of the corners and of the arm.
+        The matrices take into account the errors of the corners and of the arm.
         """
         arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in poses])
@@ -694,7 +694,7 @@ def _estimate_deviations(
 
 
 def apply_motion(pose: Floats, motion: Floats) -> Floats:
-    """Rotate a pose (4, 4) about its own origin, and translate it.
+    """Rotate a pose (4, 4) about the origin of the pose, and translate it.
 
     Both parts of the motion (6,) are in the axes of the parent frame.
     """

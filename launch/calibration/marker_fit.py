@@ -33,8 +33,8 @@ COMMON_ERROR_M = 6.5e-5
 """The standard deviation (m) per axis of the error that all touches have in common.
 
 The residuals do not show this error. Its causes are the mean bias of the detected centre of a
-tilted marker and the stereo calibration. With this value, the stated error equals the true error in
-simulated laboratories with seeds 0 to 11.
+tilted marker and the stereo calibration. If this value is used, the stated error equals the true
+error in simulated laboratories with seeds 0 to 11.
 """
 
 PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])

@@ -41,7 +41,7 @@ img { max-width: 100%; } figcaption { color: #444; }
 
 
 def compute_epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
-    """Compute the distances between corners in the right image and their epipolar lines.
+    """Compute the distance between each corner in the right image and its epipolar line.
 
     Return the right pixels (n, 2) of all common corners, and their signed distances (n,), in px.
     The distances are measured in undistorted coordinates of the right camera.

@@ -190,8 +190,8 @@ def fit_sheet_model(
 
     nominal: initial rubber of the fit.
     with_mooney: whether the weight of the Mooney term is fitted.
-    with_prior: whether nominal width and ideal rubber are used as prior values. Pushes with almost
-        the same stretch do not determine the width, and need these prior values.
+    with_prior: whether nominal width and ideal rubber are used as prior values. If all pushes have
+        almost the same stretch, they do not determine the width, and these prior values are needed.
 
     Raises SheetModelFitError if there are too few pushes, or if they do not determine a parameter.
     """

@@ -184,7 +184,7 @@ class Laboratory:
 
     @contextmanager
     def _folder(self, step: StepName) -> Iterator[Path]:
-        """Yield the folder with the captured data, or a temporary folder for simulated data."""
+        """Yield the folder with a step's captured data, or a temporary folder for simulated data."""
         if self.apparatus is None:
             yield self._find_data(step)
             return

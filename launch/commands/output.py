@@ -200,7 +200,8 @@ Values in other units are not converted.
 def print_result(result: Mapping[str, Any], *, as_json: bool) -> None:
     """Print a result on stdout, as JSON or as one line for each of its values.
 
-    In the lines, lengths are in mm, angles are in degrees, and missing values are omitted.
+    If the result is printed as lines, lengths are in mm and angles are in degrees. Missing values
+    are then omitted.
     """
     if as_json:
         print_json(result)

@@ -104,8 +104,8 @@ class Configuration:
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
         """Compute and cache the tables that the methods need.
 
-        If a table were missing, a node would use another method, and the measurement would be
-        wrong. The computation of the table of a soft body takes minutes.
+        If a table were missing, a node would use another method, and this method would be measured
+        instead. The computation of the table of a soft body takes minutes.
         """
         if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)

@@ -110,7 +110,7 @@ def _required_inputs(entry: NodeEntry) -> set[str]:
 def _list_read_topics(entry: NodeEntry) -> set[str]:
     """Return the topics that a node reads.
 
-    For a recorder, only the topics in its parameters are returned.
+    If the node is a recorder, only the topics in its parameters are returned.
     """
     if entry.type is None or entry.parameters is None:
         return set()

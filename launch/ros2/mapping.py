@@ -362,7 +362,7 @@ def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
 
 
 def _eye_pose(eye: Eye, source: Source) -> Any | None:
-    """Return the pose of the midpoint of the eyes; None if the eyes are not valid.
+    """Return the pose of the midpoint of the eyes, or None if the eye positions are not valid.
 
     The x axis of the pose points from the left to the right eye.
     """

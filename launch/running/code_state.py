@@ -24,8 +24,8 @@ def read_git_state(directory: Path) -> str:
     """Return a JSON text with the git commit of the code, and whether files have changed.
 
     The keys of the JSON object are `commit` and `changed`. Outside a git repository, `commit` is
-    the value of the environment variable that COMMIT_VARIABLE names, or null. In this case,
-    `changed` is null.
+    the value of the environment variable that COMMIT_VARIABLE names, or null. Outside a git
+    repository, `changed` is null.
 
     directory: root of the repository.
     """

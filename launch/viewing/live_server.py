@@ -2,8 +2,8 @@
 
 The server of the Foxglove SDK has no authentication and accepts requests from any web page.
 Therefore the server listens on the loopback interface only. Viewers cannot publish, call services
-or change parameters. Topics are read from the graph only while viewers subscribe to channels that
-need them. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
+or change parameters. A topic is read from the graph only while viewers subscribe to channels that
+need the topic. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
 """
 
 from __future__ import annotations

@@ -340,7 +340,7 @@ def sheet_errors(session: Session) -> Chart | None:
 
 
 def draw_joint_speeds(session: Session) -> Chart | None:
-    """Draw the maximum speed of each joint against time, in percent of the speed limit.
+    """Draw the maximum speed of each joint against time, as a percentage of its speed limit.
 
     Return None if the bag contains no joint speeds.
     """
