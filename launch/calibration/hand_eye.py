@@ -51,7 +51,7 @@ If the rotations are smaller, the poses do not determine all unknowns.
 
 RANDOM_STARTS = 60
 SUBSET_POSES = 5
-"""The number of poses in each random subset that gives initial values.
+"""The number of poses in each random subset from which initial values are computed.
 
 Subsets are used in case some poses are wrong.
 """
