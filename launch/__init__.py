@@ -1,2 +1,1 @@
-"""The command line, launch files and scenes, the supervisor of nodes, experiments and
-benchmarks."""
+"""Start and measure graphs: command line, launch files, supervision, experiments and benchmarks."""

@@ -63,14 +63,15 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 }
 """The modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
-The first module defines the typer app. Its variable is `app`, or the name after the colon. The
-other modules add commands to the app when they are imported.
+The first module defines the typer app. The app is the variable `app` of this module, or the
+variable that is named after the colon. The other modules add commands to the app when they are
+imported.
 """
 
 
 @cache
 def load_command(name: str) -> Any:
-    """Import the modules of a command in `COMMANDS` and return its click command."""
+    """Import the modules of a command in `COMMANDS`, and return the click command."""
     first, *further = COMMANDS[name]
     module, _, attribute = first.partition(":")
     app: typer.Typer = getattr(_import(module), attribute or "app")
@@ -87,9 +88,9 @@ def _import(module: str) -> Any:
 
 
 INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms", "view"})
-"""The commands that SIGINT ends without cleanup until their event loop handles the signal.
+"""The commands that SIGINT ends without cleanup until their event loop handles SIGINT.
 
-In all other commands, Python's handler raises KeyboardInterrupt, and the command cleans up.
+In all other commands, Python's signal handler raises KeyboardInterrupt, and the command cleans up.
 """
 
 
@@ -129,8 +130,8 @@ class CommandGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that the arguments name.
 
-        Python's SIGINT handler is restored for commands that need it. Raises CommandError for a
-        command of ROS 2 that does not exist here.
+        Python's SIGINT handler is restored for commands that need it. Raises CommandError if the
+        command exists only in ROS 2.
         """
         if args and (instead := ROS_COMMANDS.get(args[0])):
             raise CommandError(f'no command "{args[0]}"; {instead}', BAD_INPUT)
@@ -155,7 +156,7 @@ app = typer.Typer(
 
 
 def _print_version(requested: bool) -> None:
-    """Print the version and exit if the option --version is given."""
+    """Print the version and exit if `requested` is true, which means that --version is given."""
     if requested:
         from importlib.metadata import version
 
@@ -190,14 +191,17 @@ def main() -> None:
 
 
 def error_text(error: Exception) -> str:
-    """Return the text of an error; for an error of the operating system, add path and remedy."""
+    """Return the text of an error.
+
+    If it is an error of the operating system, the path and the remedy are added.
+    """
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
     return str(make_write_error(Path(error.filename or "standard output"), error))
 
 
 def explained_by(error: Exception) -> str | None:
-    """Return the command line that explains an error; None if its text contains the remedy."""
+    """Return the command line that explains an error, or None if the text contains the remedy."""
     if not isinstance(error, FlexsheetError) or isinstance(error, CommandError):
         return None
     if error.exit_code == BAD_INPUT or isinstance(error.__cause__, FileNotFoundError):
@@ -206,7 +210,10 @@ def explained_by(error: Exception) -> str | None:
 
 
 def exit_code(error: Exception) -> int | None:
-    """Return the exit code of an error that the user can correct; None for a program error."""
+    """Return the exit code of an error, or None if it is an error in the program.
+
+    All other errors can be corrected by the user.
+    """
     if isinstance(error, FlexsheetError):
         return error.exit_code
     return FAILED if isinstance(error, OSError) and error.errno in DISK_ERRORS else None

@@ -1,6 +1,6 @@
 """Export bags as MCAP files with standard schemas, which Foxglove and rerun can open.
 
-Each topic becomes a JSON channel of the same name. It contains the fields of the topic, without
+Each topic becomes a JSON channel of the same name. It contains the fields of the topic, except for
 arrays of more than `json_channel.MAX_ARRAY` values. Images and 3D data become separate channels:
 
     stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
@@ -11,7 +11,7 @@ arrays of more than `json_channel.MAX_ARRAY` values. Images and 3D data become s
 
 The axes of the world frame are x to the right, y up, and z towards the user. The time of a message
 is when it was recorded. Times count from 1970 if the bag contains the wall-clock time of its start.
-Otherwise they count from the start of the recording computer.
+Otherwise, they count from the time when the recording computer was started.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def export(
     contains their names.
 
     topics: names of the topics to export; None: all topics.
-    progress: function that is called with the exported and the total duration (s).
+    progress: function that is called with the duration exported so far and the total duration (s).
 
     Raises ExportError if the export fails, and BagError if the bag cannot be read.
     """
@@ -210,7 +210,7 @@ def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) 
 
 
 def check_free_space(output: Path) -> None:
-    """Raise OSError if the disk of the output file is nearly full."""
+    """Raise OSError if the disk on which the output file will be written is nearly full."""
     if free_bytes(output.parent) < MIN_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -2,7 +2,7 @@
 
 A bag of ROS 2 is an MCAP file with messages in CDR encoding. `flexsheet.launch.ros2.mapping`
 defines the topics and types. Timestamps count from 1970 if the bag contains the wall-clock time of
-its start. Otherwise they count from the start of the recording computer.
+its start. Otherwise, they count from the time when the recording computer was started.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def export_ros2(
     output: folder to create, which will contain metadata.yaml and an MCAP file. If the name ends
         with .mcap, only the MCAP file is written, and it contains the same metadata.
     topics: names of the flexsheet topics to convert; None: all topics.
-    progress: function that is called with the converted and the total duration (s).
+    progress: function that is called with the duration converted so far and the total duration (s).
 
     Raises ExportError or Ros2Error if the export fails, and BagError if the bag cannot be read.
     """

@@ -1,8 +1,8 @@
 """Convert bags to tables: one Parquet file per topic, or a table in memory.
 
-Each row contains one message. The first columns contain the recording time, and the timestamps,
-clock, writer and sequence number of the message's header. Each message field becomes one or more
-columns, which have the name of the field with its unit:
+Each row contains one message. The first columns contain the recording time. The next columns
+contain the timestamps, clock, writer and sequence number from the message's header. Each message
+field becomes one or more columns, which have the name of the field with its unit:
 
     number, text, timestamp          one column
     vector of 2 or 3                 FIELD.x, FIELD.y, FIELD.z
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 MAX_VECTOR = 6
 ROWS_PER_GROUP = 2000
 MAX_GROUP_BYTES = 64 << 20
-"""The size (bytes) of buffered images above which the buffer is written as a row group."""
+"""The size (bytes) of the buffered images at which they are written as a row group of the file."""
 
 TWIST = tuple(
     f"{kind}_{axis}_{unit}"
@@ -186,7 +186,7 @@ def _is_vector(arguments: tuple[Any, ...]) -> bool:
 
 
 def _find_type(annotation: Any) -> Any:
-    """Return the Arrow type of a column for values with a type annotation."""
+    """Return the Arrow type of a column whose values have the given type annotation."""
     arrow = _arrow()
     inner, spec = split_annotation(annotation)
     if spec is not None:
@@ -202,7 +202,7 @@ def _find_type(annotation: Any) -> Any:
 
 
 def _make_conversion(annotation: Any) -> Get:
-    """Return a function that converts a value to the Arrow type of its annotation."""
+    """Return a function that converts values of an annotated type to the Arrow type."""
     inner, spec = split_annotation(annotation)
     if spec is not None:
         return np.ravel
@@ -276,7 +276,8 @@ class TableBuilder:
     def add(self, message: Message, header: Header, log_ns: int) -> None:
         """Add a row for a message.
 
-        The column `time_s` is the source time of the message since the start of the bag.
+        The column `time_s` contains the source timestamp of the message, in seconds since the start
+        of the bag.
 
         log_ns: time when the message was recorded, ns.
         """
@@ -350,7 +351,7 @@ def write_parquet(
 
     topics: names of the topics; None: all topics.
     images: whether the tables contain images.
-    progress: function that is called with the converted and the total duration (s).
+    progress: function that is called with the duration converted so far and the total duration (s).
 
     Raises ExportError if the export fails, and BagError if the bag cannot be read.
     """

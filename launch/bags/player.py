@@ -17,7 +17,7 @@ from flexsheet.messages.clock_table import shift_stamps
 from flexsheet.messages.topics import Delivery, find_topic
 
 Progress = Callable[[float, float], None]
-"""A function that is called with the duration (s) already played and the total duration (s)."""
+"""A function that is called with the duration played so far and the total duration (s)."""
 
 
 NEVER_PLAYED = {
@@ -40,7 +40,7 @@ class TopicSelection:
 def select_topics(
     recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
 ) -> TopicSelection:
-    """Select the topics of a bag that command-line tools may publish in a graph.
+    """Select the topics of a bag that command-line tools are allowed to publish in a graph.
 
     recorded: topics of the bag.
     wanted: topics to play; empty for all topics.
@@ -84,7 +84,7 @@ async def play(
 
     rate: playback speed divided by the recorded speed.
     start_s: time in the bag at which playback starts, s.
-    progress: function that is called with the played and the total duration (s).
+    progress: function that is called with the duration played so far and the total duration (s).
     """
     summary = BagReader(bag).info()
     begin_ns = summary.start_ns + round(start_s * 1e9)

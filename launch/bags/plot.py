@@ -53,7 +53,7 @@ def read_fields(
     """Read numeric message fields from a bag.
 
     names: names of the fields, as "TOPIC.FIELD" or "TOPIC.FIELD.FIELD".
-    progress: function that is called with the read and the total duration (s).
+    progress: function that is called with the duration read so far and the total duration (s).
 
     Raises BadInputError if the bag does not contain a topic or field, or if a field is not numeric.
     """

@@ -3,8 +3,8 @@
 The node is built from the resolved launch file in the bag. Its status messages contain the order
 and time of the messages that it handled (`messages.types.Status.execution_log`). The replay follows
 this log, so it skips the same messages as the live node. Bags of earlier versions contain no log.
-For them, the replay passes all recorded inputs to the node in the order in which they were
-recorded, and calls timers when they are due.
+If a bag contains no log, the replay passes all recorded inputs to the node in the order of
+recording, and calls timers when they are due.
 
 The replay runs twice, and both runs must give the same bytes. The fields of the outputs are
 compared with the recorded fields, with a tolerance.
@@ -61,8 +61,8 @@ class ReplayResult:
 
     messages_in: number of input messages.
     missing: number of messages in the execution log that the bag does not contain.
-    by_execution_log: whether the replay followed the node's execution log. Otherwise it followed
-        the order of recording.
+    by_execution_log: whether the replay followed the node's execution log. If not, it followed the
+        order in which the messages were recorded.
     logged_until_ns: end of the execution log, ns, on the clock of the node's host.
     """
 
@@ -128,7 +128,7 @@ class Verification:
 
     @property
     def repeatable(self) -> bool:
-        """Return whether both replays were without errors and gave the same bytes."""
+        """Return whether both replays ran without errors and gave the same bytes."""
         return self.same_bytes and self.errors == 0
 
     @property
@@ -367,7 +367,10 @@ class RecordedInputs:
     """A reader that finds the recorded inputs of a node in the order of the execution log."""
 
     LOOK_AHEAD = 5000
-    """The maximum number of further messages that are searched for a logged message."""
+    """The maximum number of further messages of the bag that are read to find one logged message.
+
+    A logged message is one that the node's execution log contains.
+    """
 
     def __init__(self, bag: Path, node: Node) -> None:
         self._bag, self._node = bag, node
@@ -499,9 +502,10 @@ def compare(
 def compute_field_differences(
     one: BaseModel, other: BaseModel, prefix: str = ""
 ) -> dict[str, float]:
-    """Return the differences between two messages, by the name of each field that differs.
+    """Return the differences between two messages as a mapping from field names to differences.
 
-    A difference is the maximum absolute difference of numbers, or 1 for other values.
+    Fields that are equal are omitted. If a field contains numbers, its difference is the maximum
+    absolute difference. Otherwise, it is 1.
     """
     found: dict[str, float] = {}
     for name in type(one).model_fields:
@@ -539,8 +543,9 @@ def _distance(a: Floats, b: Floats) -> float:
 def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: ResolvedNode) -> None:
     """Raise BagError if the inputs of the node were not recorded.
 
-    A recorded topic may have no messages. An input that no node of the graph publishes may be
-    missing.
+    An input counts as recorded if a recorder of the graph reads its topic, even if the bag contains
+    no message of it. Inputs that no node of the graph publishes are not checked. BagError is also
+    raised if the bag contains no message for any input.
     """
     recorded = set(reader.topics)
     for other in plan.nodes.values():

@@ -2,7 +2,7 @@
 
 The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row of the table is
 a pose of the arm at rest. It contains six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) and
-the names of two image files (`left`, `right`). Instead of images, a row may contain the pose of the
+the names of two image files (`left`, `right`). Instead of images, a row can contain the pose of the
 board in the left camera's frame. The columns are then `board_x_m`, `board_y_m`, `board_z_m`
 (position of the first corner), and `board_rx_rad`, `board_ry_rad`, `board_rz_rad` (rotation
 vector).
@@ -92,8 +92,8 @@ class ArmPosesError(FlexsheetError, ValueError):
 def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRig:
     """Return the lenses and poses of the stereo camera.
 
-    The lenses and the transform between them are from the calibration, or from the scene without a
-    calibration. The pose in the world is always from the scene.
+    If a calibration is given, it provides the lenses and the transform between them. Otherwise, the
+    scene provides them. The pose in the world is always from the scene.
     """
     measured = scene.camera if calibration is None else calibration
     pose = scene.camera.world_from_left
@@ -174,13 +174,14 @@ def read_detections(
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
     """Read the table of arm poses in a folder, and detect the board in the images.
 
-    Return the detections, and (pose name, reason) for each pose without a detected board.
+    Return the detections, and (pose name, reason) for each pose in which the board was not
+    detected.
 
     rig: stereo camera. A board pose in the table is projected into its images.
     size: required (width, height) of the images, px.
 
-    Raises ArmPosesError or BadInputError for an invalid table, and CalibrationError for unusable
-    images.
+    Raises ArmPosesError or BadInputError if the table is invalid, and CalibrationError if images
+    cannot be used.
     """
     rows = read_pose_table(folder)
     if rows[0].images is None:
@@ -214,7 +215,7 @@ def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board
 
 
 def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
-    """Project the corners of a board with a known pose into both images, without noise.
+    """Project the corners of a board with a known pose into both images, and add no noise.
 
     Raises ArmPosesError if the board is behind a camera.
     """
@@ -332,12 +333,12 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 
 
 class SimulatedArm:
-    """A simulated arm without a sheet, with errors of the base pose and the joint angles.
+    """A simulated arm that holds no sheet, and whose base pose and joint angles have errors.
 
-    Without an apparatus (true hardware parameters), the base deviates at random from the scene, and
-    each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, the arm has the base
-    pose and the joint offsets of the apparatus, and each joint rests at a random angle within its
-    backlash.
+    If an apparatus (true hardware parameters) is given, the arm has the base pose and the joint
+    offsets of the apparatus. Each joint then rests at a random angle within its backlash.
+    Otherwise, the base deviates at random from the scene, and each joint has random errors with the
+    standard deviation SIMULATED_JOINT_RAD.
     """
 
     def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:
@@ -388,7 +389,7 @@ def simulate_poses(
     places: number of poses.
     apparatus: true parameters of camera and arms; None: the arms deviate at random from the scene.
 
-    Raises BoardError for a board that cannot be rendered.
+    Raises BoardError if the board cannot be rendered.
     """
     random = np.random.default_rng([seed, side == "left", 1])
     true_camera = apply_apparatus(scene, apparatus).camera

@@ -50,9 +50,10 @@ class RigFit:
     """A fitted stereo rig and the residuals of the fit.
 
     rig: parameters (22,).
-    poses: board poses (pairs, 6) in the left camera's frame, as rotation vector and position.
-    residuals: detected minus projected corners (n, 2), in px, of the left and right image of each
-        pair.
+    poses: board poses (pairs, 6) in the left camera's frame, each as a rotation vector and a
+        position.
+    residuals: detected minus projected positions (n, 2), in px, of the n corners in the left and in
+        the right image of each pair.
     sigma_px: standard deviation of one coordinate of a corner.
     covariance: covariance matrix (22, 22) of the parameters.
     """
@@ -130,9 +131,11 @@ def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """The residuals of one image pair, with derivatives.
+    """The m residuals of one image pair, with derivatives.
 
-    shifts: residuals (m,), px.
+    Each corner in each image has two residuals, one along x and one along y.
+
+    shifts: detected minus projected pixel coordinates (m,), px.
     by_rig: derivatives (m, 22) with respect to the parameters of the rig.
     by_pose: derivatives (m, 6) with respect to the board pose.
     """
@@ -171,7 +174,7 @@ def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Line
 class _Reduced:
     """The normal equations of the rig after elimination of the board poses.
 
-    matrix: matrix (22, 22).
+    matrix: left-hand matrix (22, 22).
     side: right-hand side (22,).
     poses: for each board pose, the inverse of its block (6, 6), its gradient (6,) and its coupling
         to the rig (22, 6).
@@ -185,7 +188,7 @@ class _Reduced:
 def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
     """Return the Levenberg-Marquardt equations of the rig, with the board poses eliminated.
 
-    damping: number that is added to 1 to give the factor of the diagonal.
+    damping: damping of the method; the diagonal is multiplied by 1 + `damping`.
     """
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []
@@ -204,7 +207,7 @@ def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
 def _scaled_inverse(matrix: Floats) -> Floats:
     """Invert a symmetric positive definite matrix with different units in its rows.
 
-    Raises NotDeterminedError if the matrix is not positive definite or is nearly singular.
+    Raises NotDeterminedError if the matrix is not positive definite or if it is nearly singular.
     """
     scale = np.sqrt(np.diag(matrix))
     if not (np.isfinite(scale).all() and (scale > 0).all()):

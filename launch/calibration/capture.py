@@ -1,7 +1,8 @@
 """Select image pairs of a board for a stereo calibration while the camera is running.
 
 A pair is accepted if the board is at rest in a new pose and if the pair improves the coverage. The
-coverage counts cells of the image, tilts and distances of the board, and the number of pairs.
+coverage is complete if there are enough pairs in total. There must also be enough pairs with the
+board in each cell of the images, at each tilt, and at each distance.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ NEW_POSE_PX = 12.0
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""The minimum size of a near board, and the maximum size of a far board.
+"""The minimum size of a board that counts as near, and the maximum size of one that counts as far.
 
 The size is the length of the board's diagonal divided by the length of the image's diagonal.
 """
@@ -58,8 +59,9 @@ class Bin:
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
     """Return the required number of image pairs for each condition, for a total of `pairs`.
 
-    Cells at the outer edges of the two images are excluded, because only one camera sees them at
-    most distances. These are the left edge of the left image and the right edge of the right image.
+    Cells at the outer edges of the two images are excluded, because only one camera sees the board
+    there at most distances. These are the left edge of the left image and the right edge of the
+    right image.
     """
     count = max(1, round(0.1 * pairs))
     required = {Bin("pairs", ""): pairs}
@@ -86,7 +88,10 @@ class PairAssessment:
 
 
 class Capture:
-    """A selector of image pairs for a calibration. It counts the pairs that meet each condition."""
+    """A selector of image pairs for a calibration.
+
+    It counts the accepted pairs that meet each condition (`Bin`).
+    """
 
     def __init__(
         self,
@@ -215,7 +220,7 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
     effect.
 
     pose: pose of the board (6,) in the left camera's frame.
-    middle: centre of the board (3,), in m, in its own frame.
+    middle: centre of the board (3,), in m, in the board's frame.
     """
     transform = pose_transform(pose)
     centre = transform[:3, :3] @ middle + transform[:3, 3]

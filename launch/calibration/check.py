@@ -230,7 +230,7 @@ def check_stereo(
 def calibrate_plain_opencv(
     pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
 ) -> StereoRig:
-    """Calibrate a stereo camera as in OpenCV's tutorials, for comparison.
+    """Calibrate a stereo camera in the same way as OpenCV's tutorials, for comparison.
 
     The lens parameters are fitted first, and then only the transform between the cameras.
 
@@ -264,7 +264,7 @@ PLAIN_HALF_WINDOW_PX = 5
 
 
 def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
-    """Find chessboard corners as in OpenCV's tutorials, for comparison.
+    """Find chessboard corners in the same way as OpenCV's tutorials, for comparison.
 
     The corners are refined in a fixed window of 11 px. Return None if the board is not found in
     both images.
@@ -293,16 +293,17 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate a stereo calibration by measuring image pairs that were not used.
+    """Cross-validate a stereo calibration by measuring image pairs that it does not use.
 
     The calibration is repeated with some pairs left out each time, and these pairs are measured.
-    The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
-    are similar. For chessboards, the calibration of OpenCV's tutorials is evaluated in the same
-    way, for comparison.
+    The pairs are divided into G groups. The pairs i, i+G, i+2G, ... form one group, which is left
+    out together. Consecutive pairs are in different groups, because their images are similar. If
+    the board is a chessboard, the calibration of OpenCV's tutorials is evaluated in the same way,
+    for comparison.
 
-    leave_out: number of pairs that are left out together.
+    leave_out: number of pairs in each group.
 
-    Raises CalibrationError for unusable images, and if too few pairs remain.
+    Raises CalibrationError if images cannot be used, or if too few pairs remain.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}

@@ -1,9 +1,9 @@
 """Run all calibrations of a laboratory in sequence, and store their results in one folder.
 
 This is called commissioning (`flexsheet commission`). The folder contains the state
-(`commission.json`), the calibration files, a scene and a launch file that use them, and a report.
-Each step starts from the scene with the results of all earlier steps. If a step is repeated, all
-later steps must therefore be run again.
+(`commission.json`), the calibration files, and a report. It also contains a scene and a launch file
+that use the calibration files. Each step starts from the scene with the results of all earlier
+steps. If a step is repeated, all later steps must therefore be run again.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ class Commissioning:
     apparatus: true parameters of a simulated laboratory, as given by --apparatus; None for real
         devices.
 
-    Raises CommissionError if the folder belongs to other files.
+    Raises CommissionError if the commissioning in the folder was started with other files.
     """
 
     folder: Path
@@ -231,7 +231,7 @@ class Commissioning:
             return State.model_validate_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, ValidationError) as error:
             raise CommissionError(
-                f"{path}: this is not a valid state of a commissioning: {error}; use a new folder"
+                f"{path}: not a valid commissioning state file: {error}; use a new folder"
             ) from error
 
     @property
@@ -417,7 +417,9 @@ def _verification_figures(state: State) -> Mapping[str, Any]:
 
 
 def format_verdict(state: State) -> list[str]:
-    """Return whether the laboratory meets all tolerances, in one line, and one line per doubt.
+    """Return a line that states whether the laboratory meets all tolerances, then the doubts.
+
+    Each doubt is one line.
 
     The result is empty before the verification.
     """
@@ -505,8 +507,9 @@ The last key that exists is used.
 def _find_measured_errors(figures: Mapping[str, Any]) -> dict[str, float]:
     """Return the measured errors by metric.
 
-    Errors of sheet and fingertip are means over the stroke, the others are measured at rest. Real
-    devices have no true errors, so only the error of the sheet that they report is known.
+    The errors of sheet and fingertip are means over the stroke. The other errors are measured at
+    rest. The true errors of real devices are unknown, so the result then contains only the sheet
+    error that the devices report.
     """
     stroke = figures.get("stroke", {})
     found = dict(figures.get("at_rest", {}).get("after", {}))
@@ -578,18 +581,18 @@ def _describe_effects(figures: Mapping[str, Any]) -> str:
 def list_limits(state: State) -> list[str]:
     """Return texts that state what limits the accuracy, with the most important one first.
 
-    The first text names the metric that is nearest to its tolerance, if the laboratory is verified.
-    The others name the uncertainties of the steps.
+    If the laboratory is verified, the first text names the metric that is nearest to its tolerance.
+    The other texts name the uncertainties of the steps.
     """
     nearest = _describe_nearest_metric(_verification_figures(state))
     return ([] if nearest is None else [nearest]) + _rank_uncertainties(state)
 
 
 SMALL_ERROR_RATIO = 0.5
-"""The maximum ratio of the error at rest to the error in motion at which the first one is small.
+"""The maximum ratio of error at rest to error in motion for which the error at rest is small.
 
-Independent errors add in quadrature, so the error at rest then causes at most a quarter of the mean
-square.
+Independent errors add in quadrature. Below this ratio, the error at rest therefore causes at most a
+quarter of the mean square error in motion.
 """
 
 

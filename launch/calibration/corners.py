@@ -28,15 +28,15 @@ last step.
 SCALE = 2
 """The factor by which images are enlarged before corners are refined.
 
-OpenCV's refinement interpolates linearly between pixels. Without enlargement, this would shift
-corners by 0.015 px and change the measured size of the board by 3e-5. Also, more markers are
-detected in enlarged images.
+OpenCV's refinement interpolates linearly between pixels. If images were not enlarged, this would
+shift corners by 0.015 px and change the measured size of the board by 0.003 %. Also, more markers
+are detected in enlarged images.
 """
 
 MIN_CORNERS = 8
 """The minimum number of ChArUco corners in an image.
 
-With fewer corners, the board's pose is inaccurate.
+If there are fewer corners, the board's pose is inaccurate.
 """
 
 MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
@@ -52,7 +52,7 @@ CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
 """The standard deviation (px) of the Gaussian filter for ChArUco images.
 
-It is small, because markers are close to the corners.
+The filter is narrow, because markers are close to the corners.
 """
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
@@ -81,7 +81,7 @@ class BoardView:
 class BoardPair:
     """The board corners in the two images of one board pose.
 
-    For a ChArUco board, the images may show different corners.
+    The two images of a ChArUco board can show different corners.
     """
 
     left: BoardView
@@ -131,7 +131,10 @@ def describe(board: Board) -> str:
 
 
 def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's ChArUco board. Raises CalibrationError for an unsuitable marker dictionary."""
+    """Make OpenCV's ChArUco board.
+
+    Raises CalibrationError if the marker size or the dictionary is unsuitable.
+    """
     name = board.dictionary or ""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if board.marker_m is None or number is None:
@@ -159,8 +162,8 @@ def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
 def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
     """Make a ChArUco detector that accepts a corner next to only one marker.
 
-    With OpenCV's default of two markers, a quarter of the corners would be lost, mostly at the
-    image's edge. Later steps correct or exclude wrong corners.
+    If two markers were required, as by default in OpenCV, a quarter of the corners would be lost,
+    mostly at the image's edge. Later steps correct or exclude wrong corners.
     """
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
@@ -274,7 +277,7 @@ def _refine_corners(
 def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
     """Renumber the corners (n, 2) of the right image to match the left image.
 
-    A detector may start at either end of the board, or at any corner of a square board. Because the
+    A detector can start at either end of the board, or at any corner of a square board. Because the
     cameras of a stereo rig are nearly parallel, the matching numbering has the same directions in
     both images.
     """

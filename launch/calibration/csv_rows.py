@@ -46,9 +46,9 @@ def read_table(
 
     columns: names of all permitted columns.
     check_header: function that returns further problems of the header. Its arguments are the
-        location and the column names.
+        location of the header and the column names in it.
 
-    Raises BadInputError for an unreadable or empty file, and for wrong columns.
+    Raises BadInputError if the file cannot be read, is empty, or has wrong columns.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

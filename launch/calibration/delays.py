@@ -1,9 +1,9 @@
-"""Measure the delays of arms and camera.
+"""Measure the delays of the arms and the camera.
 
 The servo lag is the time by which an arm lags behind its commands. The node that controls an arm
-measures the lag from commanded and measured joint angles. It starts with the lag in the launch
-file, and its self-check reports a deviation from that value. Therefore, the measured lag is written
-to the launch file.
+measures the lag from commanded and measured joint angles. The node starts with the lag in the
+launch file, and its self-check reports a deviation from that value. Therefore, the measured lag is
+written to the launch file.
 
 The stamp offset is the time of an exposure minus its timestamp. The camera sees the marks on both
 clamps while the arms move the sheet. The motion of the marks in the images is compared with the
@@ -263,7 +263,7 @@ def measure_in_simulation(
     """Measure the servo lags of simulated arms and the timestamp offset of a simulated camera.
 
     calibration: stereo calibration that is used to triangulate the marks. If it is None, the
-    scene's camera model is used.
+        scene's camera model is used.
     """
     servo = measure_lags_in_simulation(scene, apparatus)
     stamp = simulate_stamp_offset(scene, apparatus, calibration=calibration, seed=seed)

@@ -33,16 +33,16 @@ MAX_LATENCY_S = 0.15
 STEP_S = 2e-4
 JITTERS_S = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
 ERROR_RATES = (0.003, 0.01, 0.03, 0.1, 0.2)
-"""The fractions of wrongly classified images that are considered.
+"""The fractions of wrongly classified images that the estimation considers.
 
-`JITTERS_S` contains the standard deviations (s) of the times that are considered.
+`JITTERS_S` contains the standard deviations (s) that it considers for the errors of the times.
 """
 
 MIN_CONTRAST = 3.0
 """The minimum difference in grey levels between images of the white and of the black state."""
 
 SIMULATED_SWITCHES, LEVELS = 60, 16
-"""The numbers of simulated switches, and of brightness levels of a partly lit exposure."""
+"""The number of simulated switches, and of brightness levels of a partly lit exposure."""
 
 
 class DisplayLatencyError(FlexsheetError, ValueError):
@@ -77,7 +77,8 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
     wrongly. The result is the mean and the standard deviation of the posterior distribution with a
     uniform prior.
 
-    Raises DisplayLatencyError if there are too few switches, or if the images do not show them.
+    Raises DisplayLatencyError if there are too few switches, or if the images do not show the
+    switches.
     """
     switches = len({one.switched_s for one in images})
     if switches < MIN_SWITCHES:

@@ -5,9 +5,9 @@ A mark with the position m in the frame of the clamped edge is measured at the w
 world_from_base exp(b) forward(q + d) flange_from_edge exp(e) m + c f
 
 where q are the reported joint angles and f is the force of the stretched sheet on the edge. The
-unknowns are the pose errors b of the base and e of the edge, the joint offsets d, and the
-compliance c of the flange. A pose error consists of a rotation vector and a translation, and exp
-converts it to a matrix.
+unknowns are the pose error b of the base, the pose error e of the edge, the joint offsets d, and
+the compliance c of the flange. A pose error consists of a rotation vector and a translation, and
+exp converts it to a matrix.
 
 The marks determine the total effect of the unknowns, but not each unknown. In the measured working
 range, the total effect is sufficient. Each unknown therefore has a normal prior distribution, and
@@ -38,7 +38,11 @@ from flexsheet.nodes.models.rigid import (
 from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
-"""The indices of the unknowns: base pose error, joint offsets, edge pose error, compliance."""
+"""The indices of the unknowns in the vector (19,) of the fit.
+
+The unknowns are the pose error of the base, the joint offsets, the pose error of the edge, and the
+compliance of the flange.
+"""
 
 PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
 """The standard deviations (19,) of the prior distribution of the unknowns, in rad, m and m/N."""
@@ -106,7 +110,7 @@ class EdgeFit:
     """The fitted parameters of an arm, with the errors of the fit.
 
     residual_rms_m: rms distance between measured and fitted positions of the marks.
-    edge_std_m: standard deviation of a mark's fitted position, all three axes together.
+    edge_std_m: standard deviation of a mark's fitted position, with all three axes combined.
     compliance_std_m_per_n: standard deviation of the compliance.
     covariance: covariance (19, 19) of the unknowns.
     """
@@ -172,7 +176,10 @@ def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[
 
 
 class _ArmModel:
-    """A model that computes the positions of an arm's marks from the unknowns (19,) of the fit."""
+    """A model that computes the positions of the marks on an arm's clamp.
+
+    The positions follow from the 19 unknowns of the fit, which the module docstring defines.
+    """
 
     def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
         self._rows = rows
@@ -191,7 +198,7 @@ class _ArmModel:
         return apply_motion(self._base, unknowns[BASE]), apply_motion(self._clamp, unknowns[EDGE])
 
     def positions(self, unknowns: Floats) -> Floats:
-        """Return the positions (n, 3), in m, of the marks in the world for given unknowns (19,)."""
+        """Return the world positions (n, 3), in m, of the n marks for given unknowns (19,)."""
         base, clamp = self.transforms(unknowns)
         found = [
             apply(

@@ -68,7 +68,7 @@ MIN_NEW_JOINT_RAD = 0.02
 def read_edge_marks(path: Path) -> list[HeldPose]:
     """Read the measured marks from a CSV file with the columns `COLUMNS`.
 
-    Raises BadInputError for an invalid file.
+    Raises BadInputError if the file is invalid.
     """
     problems: list[Problem] = []
     joints: dict[str, tuple[Floats, Floats]] = {}
@@ -119,7 +119,7 @@ class MarkDetector:
     ) -> Floats | None:
         """Return the position (3,), in m, of the mark near an expected position.
 
-        Return None if there is no mark, or if several marks are possible.
+        Return None if no mark is found, or if several detected marks are possible.
 
         near_world_m: expected position (3,).
         left_origin_px, right_origin_px: column and row of the first pixel of a cropped image.

@@ -202,7 +202,7 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
 def read_alignments(path: Path) -> list[Alignment]:
     """Read alignments from a CSV file with the columns `COLUMNS`.
 
-    Raises BadInputError for an invalid file.
+    Raises BadInputError if the file is invalid.
     """
     problems: list[Problem] = []
     found = []
@@ -221,7 +221,8 @@ def simulate_alignments(
     """Simulate the alignments of a viewer, as measured by the simulated stereo camera.
 
     The arms hold the flat sheet at the imaginary screen. An alignment is omitted if the viewer does
-    not see the sheet behind the bead, or if the camera does not detect one of the points.
+    not see the sheet behind the bead. It is also omitted if the camera does not detect the bead or
+    the cross.
 
     apparatus: true parameters of the simulated hardware.
     calibration: camera parameters that the detector uses; None: the scene's parameters.

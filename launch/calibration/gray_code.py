@@ -28,7 +28,7 @@ WINDOW_HALF_PX = 22.0
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
-"""The maximum rms residual of a fit, in camera pixels per projector pixel of the finest stripes.
+"""The maximum rms residual (camera pixels) of a fit, divided by `MIN_STRIPE_PX`.
 
 A larger residual indicates that the window contains an edge or a fold of the sheet.
 """
@@ -59,8 +59,8 @@ class Decoded:
     """The correspondence between camera pixels and projector pixels, as decoded from images.
 
     pixels: lit camera pixels (n, 2).
-    lit_by: projector pixels (n, 2) that light them. Each is the centre of a cell of several
-        projector pixels.
+    lit_by: projector pixels (n, 2) that light these camera pixels. Each is the centre of a cell of
+        several projector pixels.
     """
 
     pixels: Floats
@@ -72,8 +72,8 @@ def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> D
 
     width_px, height_px: size of the projected image.
 
-    Raises DecodeError for a wrong number of images, for different sizes, and for too few lit
-    pixels.
+    Raises DecodeError if the number of images is wrong, if their sizes differ, or if too few pixels
+    are lit.
     """
     bits = [_bits(width_px), _bits(height_px)]
     expected = 2 * sum(bits) + 2

@@ -46,12 +46,12 @@ MIN_POSES = 6
 MIN_ROTATION_RAD = float(np.radians(5.0))
 """The minimum rms rotation (rad) of the flange about each of two axes.
 
-With smaller rotations, the poses do not determine all unknowns.
+If the rotations are smaller, the poses do not determine all unknowns.
 """
 
 RANDOM_STARTS = 60
 SUBSET_POSES = 5
-"""The number of poses in each random subset that gives initial values.
+"""The number of poses in each random subset from which initial values are computed.
 
 Subsets are used in case some poses are wrong.
 """
@@ -145,7 +145,7 @@ class LensRig:
 
 @dataclass(frozen=True, slots=True)
 class CornerView:
-    """The board corners in one image.
+    """The k board corners in one image.
 
     points_board: positions (k, 3), in m, in the board's frame.
     pixels: positions (k, 2) in the image, px.
@@ -192,12 +192,14 @@ class BaseFit:
 
     covariance: covariance (6, 6) of the motion from the estimated to the true base pose. The motion
         is a rotation (rad) about the base's origin in world axes, then a translation (m). If
-        `jackknife_ratio` is above 1, the covariance has been multiplied by its square.
+        `jackknife_ratio` is above 1, the covariance has been multiplied by `jackknife_ratio`
+        squared.
     corner_sigma_px: standard deviation of one coordinate of a corner.
     arm_sigma_rad, arm_sigma_m: standard deviations of one component of the flange's pose error.
     jackknife_ratio: standard deviation from the jackknife divided by the standard deviation from
         the fit, as rms over the six components.
-    leave_one_out: motions (n, 6) of the base when one pose is excluded from the fit.
+    leave_one_out: changes (n, 6) of the base pose if each of the n poses in turn is excluded from
+        the fit.
     """
 
     world_from_base: Floats
@@ -400,8 +402,8 @@ def _linearize_pixels(
 ) -> tuple[Floats, Floats]:
     """Compute the residuals of the corners, and their derivatives for a small flange motion.
 
-    Return residuals (m,), in px, and derivatives (m, 6) with respect to rotation (rad) and
-    translation (m).
+    Return the residuals (m,) of m pixel coordinates, in px, and their derivatives (m, 6) with
+    respect to rotation (rad) and translation (m).
     """
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
@@ -434,7 +436,8 @@ def _linearize_pixels(
 def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig) -> _Unknowns:
     """Return initial values of the unknown transforms.
 
-    These are the closed-form solution for all poses or for a random subset, whichever fits best.
+    The closed-form solution is computed for all poses and for random subsets. The solution that
+    fits all poses best is returned.
 
     flanges: poses base_from_flange (4, 4).
     boards: poses left_from_board (4, 4).
@@ -461,7 +464,8 @@ def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Lens
             best, min_score = found, score
     if best is None:
         raise HandEyeError(
-            "these poses have no initial solution; rotate the flange more, about two axes"
+            "no initial solution was found for these poses; rotate the flange by larger angles, "
+            "about at least two non-parallel axes"
         )
     return best
 
@@ -472,9 +476,10 @@ def _solve_closed_form(
     """Return Shah's closed-form solution of B F X = C, or None if the poses have no solution.
 
     Here, B is world_from_base, F is base_from_flange, X is flange_from_board and C is
-    world_from_board. With Y as the transpose of X's rotation, C Y = B F holds for all rotations.
-    Therefore, the matrix sum(kron(F, C)) maps the stacked columns of Y to n times those of B. Both
-    are first singular vectors of this matrix. The translations follow by linear least squares.
+    world_from_board. If Y is the transpose of X's rotation, C Y = B F holds for the rotations of
+    each of the n poses. Therefore, the matrix sum(kron(F, C)) maps the stacked columns of Y to n
+    times the stacked columns of B. Both are first singular vectors of this matrix. The translations
+    follow by linear least squares.
     """
     worlds = [rig.world_from_left @ board for board in boards]
     stacked = np.sum(
@@ -543,7 +548,7 @@ class _NoiseModel:
     def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
         """Return the information matrices (n, 6, 6) of the flange motions of n poses.
 
-        They include the errors of the corners and of the arm.
+        The matrices take into account the errors of the corners and of the arm.
         """
         arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in poses])
@@ -588,7 +593,8 @@ def _fit_unknowns(
             step = np.asarray(np.linalg.solve(matrix, side), np.float64)
         except np.linalg.LinAlgError as error:
             raise HandEyeError(
-                "the poses do not determine the base; rotate the flange more, about two axes"
+                "the poses do not determine the base; rotate the flange by larger angles, about "
+                "at least two non-parallel axes"
             ) from error
         unknowns = unknowns.apply_step(step)
         if np.abs(step).max() < CONVERGED_STEP:
@@ -688,7 +694,7 @@ def _estimate_deviations(
 
 
 def apply_motion(pose: Floats, motion: Floats) -> Floats:
-    """Rotate a pose (4, 4) about its own origin, and translate it.
+    """Rotate a pose (4, 4) about the origin of the pose, and translate it.
 
     Both parts of the motion (6,) are in the axes of the parent frame.
     """

@@ -33,8 +33,8 @@ COMMON_ERROR_M = 6.5e-5
 """The standard deviation (m) per axis of the error that all touches have in common.
 
 The residuals do not show this error. Its causes are the mean bias of the detected centre of a
-tilted marker and the stereo calibration. With this value, the stated error equals the true error in
-simulated laboratories with seeds 0 to 11.
+tilted marker and the stereo calibration. If this value is used, the stated error equals the true
+error in simulated laboratories with seeds 0 to 11.
 """
 
 PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])
@@ -96,7 +96,7 @@ class MarkerFit:
     marker_from_pad_m: position (3,) of the marker in the finger's frame.
     covariance_m2: covariance (3, 3) of the position.
     point_offset_m: mean (3,) of the estimated errors of the touched points, in the world frame.
-    residuals_m: residual distance (touches,) of each touch.
+    residuals_m: distance (touches,) between the measured and the fitted marker of each touch.
     points, orientations: numbers of different points and orientations.
     """
 
@@ -121,8 +121,8 @@ class MarkerFit:
 def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     """Fit the marker's position on the finger by restricted maximum likelihood.
 
-    Raises MarkerFitError for too few touches or orientations, for touches that contradict each
-    other, and for an implausible or undetermined position.
+    Raises MarkerFitError if there are too few touches or orientations, or if touches contradict
+    each other. Raises it also if the position is implausible or not determined.
     """
     orientation = np.array(group_orientations([touch.world_from_finger for touch in touches]))
     orientations = len(set(orientation))

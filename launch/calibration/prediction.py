@@ -44,7 +44,10 @@ Random = np.random.Generator
 DRAWS = 12
 DRAW_SEED = 20_000
 PIXEL_M = 0.0025
-"""The size (m) of a pixel of the predicted images. Image errors are averaged over about 100 mm²."""
+"""The size (m) of a pixel of the predicted images.
+
+Image errors are averaged over an area of about 100 mm².
+"""
 
 CELLS = 16
 """The number of mesh intervals along each side of the simulated sheet."""
@@ -77,13 +80,13 @@ compounds.
 """
 
 FRICTION, FRICTION_STD_LN = 1.24, 0.3
-"""The friction coefficient between rubber and a finger at 1 N, and its logarithmic deviation.
+"""The friction coefficient between rubber and a finger at 1 N, and the deviation of its logarithm.
 
 The second value is the standard deviation of the natural logarithm. Source: Seo et al. 2009.
 """
 
 CREEP_RATIO_PER_DECADE, CREEP_STD = 0.05, 0.02
-"""The relative decrease of the force of natural rubber per decade of time, with its deviation.
+"""The relative decrease of the force of natural rubber per decade of time, and its deviation.
 
 The second value is the standard deviation of the first value.
 """
@@ -117,8 +120,8 @@ class Knowledge:
     """The results of calibrations, for the prediction of errors.
 
     calibrations: calibrations that the nodes use.
-    edges: covariance (19, 19) of the unknowns of `fit_edges`, by side. A side without calibration
-        is absent.
+    edges: covariance (19, 19) of the unknowns of `fit_edges`, by side. A side that is not
+        calibrated is absent.
     projector_px2: covariance (2, 2) of the displacement of the projected image.
     eyes_m2: covariance (3, 3) of the midpoint between the eyes.
     stamp_std_s: standard deviation of exposure time minus timestamp.
@@ -283,8 +286,8 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
     """Return a random modulus and a random unstretched width of the sheet.
 
-    The result contains the fields `modulus_ratio` and `slack_width_offset_m`. It is empty without a
-    sheet calibration.
+    The result contains the fields `modulus_ratio` and `slack_width_offset_m`. It is empty if there
+    is no sheet calibration.
     """
     sheet = known.calibrations.sheet
     if sheet is None:

@@ -28,8 +28,8 @@ PNG_DOTS_PER_INCH = 300
 def find_black_rectangles(board: Board) -> Floats:
     """Return the black rectangles (n, 4) of a board as x, y, width and height, in m.
 
-    The origin is the corner of the first square. Raises CalibrationError if the markers do not fit
-    the board.
+    The origin is the outer corner of the first square. Raises CalibrationError if the markers do
+    not fit the board.
     """
     columns, rows, side = board.columns + 1, board.rows + 1, board.square_m
     squares = [
@@ -122,7 +122,7 @@ def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
 def write_board(board: Board, path: Path) -> None:
     """Write the board to a file, in the format of the file's suffix.
 
-    Raises CalibrationError for an unknown suffix or an unsuitable board.
+    Raises CalibrationError if the suffix is unknown or the board is unsuitable.
     """
     suffix = path.suffix.lower()
     if suffix == ".svg":

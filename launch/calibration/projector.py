@@ -72,9 +72,9 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """A calibrated projector and its residuals, in projector pixels and in metres on the sheet.
+    """A calibrated projector, with its residuals in projector pixels and in metres on the sheet.
 
-    held_out_rms_px: rms residual of poses that were excluded from the fit.
+    held_out_rms_px: rms residual of the sheet poses that were excluded from the fit.
     before_rms_px: rms residual of the initial projector.
     coverage_ratio: fraction of the image's cells that contain points.
     shift_covariance_px2: covariance (2, 2) of the mean displacement of the image. It is computed
@@ -162,8 +162,8 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
 
     guess: initial projector of the fit.
 
-    Raises ProjectorError for too few points or poses, a small depth range or coverage, and large
-    residuals.
+    Raises ProjectorError if there are too few points or poses, or if their depth range or coverage
+    is too small. Raises it also if the residuals are too large.
     """
     inliers = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _measure_depth_range(points, guess)
@@ -247,8 +247,9 @@ def _measure_coverage(pixels: Floats, projector: Projector) -> float:
 def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) -> Projector:
     """Fit the pose, one focal length, the principal point, k1, k2, p1 and p2 by least squares.
 
-    The aspect ratio and k3 are fixed to the values of `guess`. A projector with lens shift has a
-    principal point outside the image. OpenCV's fit rejects such a point, and is therefore not used.
+    The aspect ratio and k3 are fixed to the values of `guess`. If a projector has lens shift, its
+    principal point is outside the image. OpenCV's fit rejects such a point and is therefore not
+    used.
 
     inliers: mask (n,) of the points to use.
     """
@@ -312,8 +313,9 @@ def fit_keystone(
 ) -> ProjectorFit:
     """Fit a projector to the pixels that light the corners of a rectangle on the imaginary screen.
 
-    Many projectors match four corners (a homography) exactly. The result is the projector nearest
-    to `guess`, with the distortion of `guess`.
+    Many projectors light four given corners exactly, because the corners determine only a
+    homography. Of these projectors, the result is the projector that is nearest to `guess`. Its
+    lens distortion is equal to the distortion of `guess`.
 
     corners_px: projector pixels (4, 2) of bottom left, bottom right, top right, top left, as the
         user sees them.

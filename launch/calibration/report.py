@@ -41,10 +41,10 @@ img { max-width: 100%; } figcaption { color: #444; }
 
 
 def compute_epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
-    """Compute the distances between corners in the right image and their epipolar lines.
+    """Compute the distance between each corner in the right image and its epipolar line.
 
     Return the right pixels (n, 2) of all common corners, and their signed distances (n,), in px.
-    The distances are in undistorted coordinates of the right camera.
+    The distances are measured in undistorted coordinates of the right camera.
     """
     rig = StereoRig.from_fit(calibrated.fit.rig)
     rotation, position = rig.right_from_left[:3, :3], rig.right_from_left[:3, 3]

@@ -41,10 +41,13 @@ CORNER_RATIO = 6.0
 
 CORNER_ROUNDS = 2
 MAX_OUTLIER_FRACTION = 0.15
-"""The maximum fraction of outliers among the corners of a pair that is used."""
+"""The maximum fraction of outliers among the corners of a pair.
+
+Pairs with a larger fraction are not used.
+"""
 
 REPEAT_PX = 1.0
-"""The maximum median distance (px) of corners between two pairs with the same board pose."""
+"""The maximum median distance (px) of corners between two pairs that have the same board pose."""
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
@@ -98,7 +101,9 @@ def compute_misfits(
 
 
 def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> RigFit:
-    """Fit both cameras together. The initial values are from fits to single cameras and pairs.
+    """Fit both cameras together.
+
+    The initial values are from fits to each single camera and each single pair.
 
     points: corners of the board (n, 3), m.
     size: width and height of the images, px.
@@ -116,7 +121,7 @@ def count_corners(pair: BoardPair) -> int:
 
 
 def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
-    """Return the image pairs without outlier corners.
+    """Return the image pairs after removing their outlier corners.
 
     The standard deviation of the residuals is estimated from their median, because outliers hardly
     affect it. For a two-dimensional normal distribution, the median is 1.1774 standard deviations.
@@ -168,8 +173,8 @@ class PairSelection:
     found: corners of each pair, or the reason why there are none.
     good: corners of each used pair, by index.
     reasons: reason for each excluded pair, by index.
-    residuals: rms residual (2,), in px, of the left and the right image, by index. It includes
-        excluded pairs.
+    residuals: rms residual (2,), in px, of the left and the right image, by index. The residuals of
+        excluded pairs are included.
     """
 
     def __init__(self, found: Sequence[BoardPair | str], names: Sequence[str]) -> None:
@@ -183,7 +188,7 @@ class PairSelection:
             del self.good[i]
 
     def pairs(self) -> list[BoardPair]:
-        """Return the used pairs. Raises CalibrationError if they are fewer than MIN_PAIRS."""
+        """Return the used pairs. Raises CalibrationError if there are fewer than MIN_PAIRS."""
         if len(self.good) < MIN_PAIRS:
             listed = "".join(f"\n  {self._names[i]}: {text}" for i, text in self.reasons.items())
             raise CalibrationError(
@@ -210,7 +215,7 @@ class PairSelection:
         return bool(bad)
 
     def replace_pairs(self, cleaned: Sequence[BoardPair]) -> None:
-        """Replace the used pairs by pairs without outlier corners.
+        """Replace the used pairs by pairs from which outlier corners were removed.
 
         Pairs that have lost too many corners are excluded.
         """
@@ -238,9 +243,9 @@ class PairSelection:
 def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int]) -> RigFit:
     """Exclude unreliable pairs and corners, and fit the stereo rig to the remaining ones.
 
-    Excluded are pairs that contradict the other pairs (`compute_misfits`), corners with residuals
-    above six standard deviations, and pairs with large residuals. A residual is large if it exceeds
-    half a pixel and three times the median.
+    Pairs are excluded if they contradict the other pairs (`compute_misfits`) or have large
+    residuals. A pair's residual is large if it exceeds half a pixel and three times the median.
+    Corners are excluded if their residuals exceed six standard deviations.
 
     points: corners of the board (n, 3), m.
     size: width and height of the images, px.

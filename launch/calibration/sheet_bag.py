@@ -1,6 +1,6 @@
 """Read measured pushes of a finger into the sheet from a bag with the topic `force`.
 
-A push is a measured force together with the depth and position of the finger in the sheet.
+A push is a measured force, together with the depth and the position of the finger in the sheet.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""The time (s) before and after a measured force, and the maximum change of depth (m) in this time.
+"""The time (s) before and after a measured force, and the maximum depth change (m) in this time.
 
 Force gauges lag, so forces that were measured during a motion are not used.
 """
@@ -152,10 +152,10 @@ def _gap_s(motion: SampledMotion, at_ns: int) -> float:
 
 
 def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[float, float], float]:
-    """Return the depth and the position (x, y) of a fingertip, and the distance of the edges, in m.
+    """Return depth and position (x, y) of a fingertip, and the distance between the edges, in m.
 
-    The depth is the distance behind the flat sheet between the edges. The position is relative to
-    the sheet's centre.
+    The depth is the distance of the fingertip behind the flat sheet between the edges. The position
+    is relative to the sheet's centre.
 
     tip: position (3,) of the fingertip.
     left, right: poses (4, 4) of the clamped edges.

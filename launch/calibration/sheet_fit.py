@@ -28,17 +28,17 @@ EDGE_NOISE_N = 0.1
 MODEL_ERROR_RATIO = 0.03
 """The assumed error of the force model, as a fraction of the force.
 
-Residuals are divided by the combination of this error and the noise.
+Residuals are divided by the standard deviation that results from this error and the noise together.
 """
 
 OUTLIER_SIGMAS = 5.0
 """The residual, in standard deviations, above which a push is an outlier.
 
-The fit is repeated without outliers.
+The fit is repeated with the outliers omitted.
 """
 
 MAX_RMS_SIGMAS = 1.0
-"""The maximum rms residual of a valid fit, in assumed standard deviations.
+"""The maximum rms residual of a valid fit, divided by the assumed standard deviation.
 
 If it is exceeded, noise and model error are larger than assumed, and the predicted force error is
 too small. A limit for relative residuals is not useful, because noise dominates small forces, which
@@ -63,7 +63,7 @@ class MeasuredPush:
     edge_distance_m: distance between the clamped edges.
     depth_m: depth of the finger behind the plane of the sheet.
     force_n: normal force of the finger on the sheet.
-    position_m: contact point (x, y) on the stretched sheet, from its centre.
+    position_m: contact point (x, y) on the stretched sheet, relative to the sheet's centre.
     edge_force_n: force on a clamped edge; None if it was not measured.
     unloading: whether the finger was deeper before; None if unknown.
     """
@@ -87,8 +87,9 @@ class SheetModelFit:
     residual_ratio: measured force divided by fitted force, minus one (n,).
     rms_ratio, worst_ratio: rms and maximum of `residual_ratio` for used pushes with forces above
         the noise.
-    rms_sigmas: rms of the residuals divided by their assumed standard deviations. It is the larger
-        of the values for contact forces and edge forces. Outliers count as OUTLIER_SIGMAS.
+    rms_sigmas: rms of the residuals divided by their assumed standard deviations. It is computed
+        for contact forces and for edge forces, and the larger value is used. Outliers count as
+        OUTLIER_SIGMAS.
     """
 
     law: ScaledSheetModel
@@ -126,8 +127,8 @@ class Hysteresis:
 def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> Hysteresis | None:
     """Estimate the hysteresis from the measured forces during loading and unloading.
 
-    Return None if there are fewer than three used pushes of either kind. Raises SheetModelFitError
-    if the force is larger during unloading than during loading.
+    Return None if loading or unloading has fewer than MIN_HYSTERESIS_ROWS used pushes. Raises
+    SheetModelFitError if the force is larger during unloading than during loading.
     """
     elastic_n, _ = _predict(fit.law, pushes, fit.nominal_width_m)
     ratios = np.array([push.force_n for push in pushes]) / np.maximum(elastic_n, 1e-6)
@@ -168,8 +169,8 @@ NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ra
 PRIOR_WIDTH_M, PRIOR_LOG_CUBIC = 0.0005, 0.2
 """The standard deviations of the prior distributions of two parameters.
 
-The first is that of the unstretched width (m), for a measurement with a ruler. The second is that
-of the logarithm of the cubic ratio, which is 1 for ideal rubber.
+The first parameter is the unstretched width (m), which is measured with a ruler. The second is the
+logarithm of the cubic ratio, which is 1 for ideal rubber.
 """
 
 
@@ -182,14 +183,15 @@ def fit_sheet_model(
 ) -> SheetModelFit:
     """Fit the parameters of the sheet's force model to measured pushes.
 
-    The parameters are modulus times thickness, unstretched width, and the ratio of the cubic term
-    of the force to that of ideal rubber. The weight of the Mooney term is optional. The
-    least-squares fit is robust: it first uses a soft-L1 loss, and then omits outliers.
+    The parameters are the product of modulus and thickness, the unstretched width, and the cubic
+    ratio. The cubic ratio is the cubic term of the force divided by the cubic term of ideal rubber.
+    The weight of the Mooney term is optional. The least-squares fit is robust: it first uses a
+    soft-L1 loss, and then omits outliers.
 
     nominal: initial rubber of the fit.
     with_mooney: whether the weight of the Mooney term is fitted.
-    with_prior: whether nominal width and ideal rubber are used as prior values. Pushes with almost
-    the same stretch do not determine the width, and need these prior values.
+    with_prior: whether nominal width and ideal rubber are used as prior values. If all pushes have
+        almost the same stretch, they do not determine the width, and these prior values are needed.
 
     Raises SheetModelFitError if there are too few pushes, or if they do not determine a parameter.
     """
@@ -289,7 +291,7 @@ def _predict(
 ) -> tuple[Floats, Floats]:
     """Compute the contact forces (n,) and the edge forces (n,), in N, of n pushes.
 
-    width_m: nominal width of the sheet, the reference of stretch ratios.
+    width_m: nominal width of the sheet, to which stretch ratios refer.
     """
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
@@ -304,11 +306,11 @@ def _predict(
 
 
 def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
-    """Return the residuals (2, n) of contact and edge forces, in assumed standard deviations.
+    """Return the residuals (2, n) of contact and edge forces, divided by their standard deviations.
 
     The residual of an edge force that was not measured is NaN.
 
-    width_m: nominal width of the sheet, the reference of stretch ratios.
+    width_m: nominal width of the sheet, to which stretch ratios refer.
     """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
@@ -337,7 +339,7 @@ def tabulate_pushes(
     """Make a table of the ratio of measured to modelled force, from the used pushes.
 
     The axes of the table are stretch, depth, and the distances of the push from the sheet's centre
-    along x and y. Pushes must exist at every combination of stretch, x and y, but their depths may
+    along x and y. Pushes must exist at every combination of stretch, x and y. Their depths can
     differ. The ratios are interpolated at depths that all combinations cover.
 
     used: mask (n,) of the pushes to use.

@@ -22,10 +22,10 @@ OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
-"""The maximum number of problems of a file that are listed. Further problems are only counted."""
+"""The maximum number of problems of a file that are listed; further problems are only counted."""
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
-"""The maximum plausible length divided by the sheet's width, by column.
+"""The maximum plausible ratio of a length to the sheet's width, by column of the file.
 
 A larger length is probably in another unit.
 """
@@ -38,13 +38,13 @@ def read_rows(
 
     The first line contains the names of the columns. The columns `depth_mm` and `force_n` are
     required, and either `edge_distance_mm` or `stretch_ratio` (edge distance divided by the scene's
-    sheet width). The columns `x_mm` and `y_mm` (from the sheet's centre), `edge_force_n`,
+    sheet width). The columns `x_mm` and `y_mm` (relative to the sheet's centre), `edge_force_n`,
     `finger_radius_mm` and `unloading` (1 if the finger was deeper before, else 0) are optional.
     Empty lines and lines that start with # are skipped.
 
-    finger_radius_m: radius for pushes without the column `finger_radius_mm`.
+    finger_radius_m: radius that is used if the file has no column `finger_radius_mm`.
 
-    Raises BadInputError for an invalid file.
+    Raises BadInputError if the file is invalid.
     """
     problems: list[Problem] = []
     pushes: list[MeasuredPush] = []
@@ -165,14 +165,15 @@ def simulate_rows(
 ) -> list[MeasuredPush]:
     """Simulate measured pushes of a finger into the sheet at all stretches and depths of a scene.
 
-    Each depth gives one push. For rubber with hysteresis, it gives one push for loading and one for
-    unloading.
+    Each depth gives one push. If the rubber has hysteresis, each depth gives one push for loading
+    and one for unloading.
 
     places: whether to push at several points of the sheet, not only at its centre.
     noise_n: standard deviation of the noise of the contact force, N. The noise of the edge force is
         ten times as large.
     apparatus: true parameters of arms and sheet; None: the scene's parameters.
-    progress: function that is called with the numbers of finished and of all combinations.
+    progress: function that is called with the number of finished combinations and the number of all
+        combinations.
     """
     rng = np.random.default_rng(seed)
     sheet = SimulatedSheet(scene, apparatus or nominal_apparatus(scene))
@@ -207,7 +208,7 @@ def simulate_rows(
 def _simulated_cases(scene: Scene, places: bool) -> Iterator[tuple[float, tuple[float, float]]]:
     """Yield each simulated combination of a stretch ratio and a contact point (x, y), in m.
 
-    places: whether the points are all over the sheet, not only at its centre.
+    places: whether to use points all over the sheet, not only its centre.
     """
     sheet = scene.sheet
     stretches = np.linspace(

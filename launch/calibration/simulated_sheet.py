@@ -31,15 +31,16 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 JUST_TAUT_TENSION = 2e-6
 """The residual tension of slack rubber, divided by the shear modulus, for an almost taut sheet.
 
-The simulator in a running graph uses a value a hundred times as large, because its sheet may hang.
-In a sheet that is barely slack, that tension would triple the force of a small push.
+The simulator in a running graph uses a value that is a hundred times as large, because its sheet
+can hang slack. That tension would triple the force of a small push into a sheet that is barely
+slack.
 """
 
 PUSHED_CELLS, UNTOUCHED_CELLS = 24, 16
 """The numbers of mesh intervals along each side of a pushed sheet and of an untouched sheet.
 
-With 24 intervals, forces differ by 0.5 % from those with 32 intervals, and by 1 % at a depth of 2
-mm.
+Forces that are computed with 24 and with 32 intervals differ by 0.5 %, and at a depth of 2 mm by 1
+%.
 """
 
 
@@ -54,7 +55,7 @@ def simulate_push(
 ) -> tuple[float, float]:
     """Simulate a push, and return the normal force (N) and the mean force (N) on a clamped edge.
 
-    point_m: pushed point on the sheet (x, y) from its centre.
+    point_m: pushed point (x, y) on the sheet, relative to its centre.
     cells: number of mesh intervals along each side of the sheet.
     """
     edges = place_edges(np.eye(4), sheet.width_m * stretch_ratio)
@@ -75,7 +76,7 @@ def _push(
 
     edges: poses (4, 4) of the left and the right clamped edge.
     depths_m: ascending depths behind the flat sheet midway between the edges.
-    point_m: pushed point (x, y) from the centre of the flat sheet.
+    point_m: pushed point (x, y), relative to the centre of the flat sheet.
     cells: number of mesh intervals along each side of the sheet.
     """
     x, y, normal, middle = flat_axes(*edges)
@@ -114,8 +115,8 @@ class SimulatedSheet:
     """A simulated sheet between two simulated arms, with parameters that differ from the scene.
 
     The commanded poses of the edges are computed with the arm parameters of the scene. The true
-    poses deviate from them because of the errors of bases, joint angles and clamps, and because of
-    the compliance of the arms.
+    poses deviate from the commanded poses because of errors of the bases, joint angles and clamps,
+    and because the arms are compliant.
 
     apparatus: true parameters of the hardware.
     """
@@ -135,11 +136,12 @@ class SimulatedSheet:
     ) -> list[tuple[tuple[float, float], float]]:
         """Simulate a push, and return the forces (N) at each depth.
 
-        Each entry is ((normal force during loading, during unloading), force on a clamped edge).
+        Each entry is ((normal force during loading, normal force during unloading), force on a
+        clamped edge).
 
-        distance_m: commanded distance of the edges.
-        depths_m: ascending depths.
-        point_m: pushed point (x, y) from the sheet's centre.
+        distance_m: commanded distance between the edges.
+        depths_m: ascending depths of the ball behind the flat sheet.
+        point_m: pushed point (x, y), relative to the sheet's centre.
         radius_m: radius of the pushing ball. Touched rubber sticks to the ball.
         """
         edges = self._arms.hold(place_edges(np.eye(4), distance_m))
@@ -152,10 +154,10 @@ class SimulatedSheet:
         ]
 
     def hold(self, world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:
-        """Simulate the sheet at a commanded pose (4, 4), without a push.
+        """Simulate the sheet at a commanded pose (4, 4) while nothing touches it.
 
         Return the true pose (4, 4) of the flat sheet between the edges. Also return points (n, 3),
-        in m, of the true sheet. The sheet sags under its weight.
+        in m, of the true sheet, which sags under its weight.
         """
         left, right = self._arms.hold(place_edges(world_from_sheet, distance_m))
         x, y, normal, middle = flat_axes(left, right)
@@ -173,7 +175,7 @@ def simulate_force(
 ) -> float:
     """Simulate a push, and return the normal force (N).
 
-    point_m: pushed point on the sheet (x, y) from its centre.
+    point_m: pushed point (x, y) on the sheet, relative to its centre.
     """
     return simulate_push(sheet, stretch_ratio, depth_m, point_m, finger_radius_m)[0]
 
@@ -196,7 +198,7 @@ def solve_sheet(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> DeformedSheet:
-    """Compute the shape of the simulated sheet between two edges, with or without a fingertip.
+    """Compute the shape of the simulated sheet between two edges, which a fingertip can touch.
 
     world_from_left_edge, world_from_right_edge: poses (4, 4) of the clamped edges.
     finger_tip: position (3,) of the fingertip; None: nothing touches the sheet.
@@ -218,8 +220,9 @@ def make_error_function(
 ) -> Callable[[Image, Image], Floats]:
     """Return a function that computes the errors of the image that the user sees on the sheet.
 
-    The arguments of the function are the projector images of the two coordinate ramps. Its result
-    is the error (n,), in m, at each point of the simulated sheet that the eye can see.
+    The arguments of the returned function are two projector images, which encode the x and the y
+    coordinate as brightness (coordinate ramps). Its result is the error (n,), in m, at each point
+    of the simulated sheet that the eye can see.
     """
     sheet = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m

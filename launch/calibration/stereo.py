@@ -1,7 +1,8 @@
 """Calibrate a stereo camera (rig) from images of a calibration board.
 
 The lens model is a pinhole with the distortion coefficients k1, k2, p1, p2. The coefficient k3 is
-fixed to 0, because boards that do not fill the image cannot separate it from k2.
+fixed to 0, because images of boards that do not fill the image do not determine k2 and k3
+separately.
 """
 
 from __future__ import annotations
@@ -76,16 +77,16 @@ def calibrate_stereo(
 ) -> CalibrationResult:
     """Calibrate a stereo camera from pairs of images of a board.
 
-    Excluded are pairs without the board, repeated pairs, and pairs that contradict the others
-    (`compute_misfits`). Also excluded are corners with residuals above six standard deviations. A
-    pair is excluded if its residual exceeds both half a pixel and three times the median. The
-    result contains the reasons.
+    A pair is excluded if it does not show the board or repeats the pose of another pair. It is also
+    excluded if it contradicts the other pairs (`compute_misfits`). Corners with residuals above six
+    standard deviations are also excluded. A pair is excluded if its residual exceeds both half a
+    pixel and three times the median. The result contains the reason for each excluded pair.
 
     working_distance_m: distance to which the uncertainty applies; None: median distance of the
         boards.
 
-    Raises CalibrationError for unusable images, if fewer than MIN_PAIRS pairs remain, or if the
-    pairs do not determine the rig.
+    Raises CalibrationError if images cannot be used, if fewer than MIN_PAIRS pairs remain, or if
+    the pairs do not determine the rig.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     selection = PairSelection(found, [path.name for path in left_paths])

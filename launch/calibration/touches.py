@@ -36,13 +36,13 @@ COLUMNS = (*REQUIRED, *NORMAL)
 MAX_PROBLEMS = 20
 MAX_TILT_DEG = 120.0
 MAX_LENGTH_MM = 5000.0
-"""The maximum plausible coordinate (mm). A larger number is probably in another unit."""
+"""The maximum plausible coordinate (mm). A larger number probably has another unit."""
 
 
 def read_touches(path: Path, scene: Scene) -> list[Touch]:
     """Read touches from a CSV file. The document docs/set-up-marker.md lists the columns.
 
-    Raises BadInputError for an invalid file.
+    Raises BadInputError if the file is invalid.
     """
     problems: list[Problem] = []
     touches = []
@@ -116,7 +116,7 @@ TOUCHED_ORIENTATIONS = 6
 These are the orientations in which the measured marker has the smallest uncertainty.
 """
 SIMULATED_POINTS_M = np.array([[x, y, 0.01] for y in (0.0, 0.04) for x in (-0.03, 0.01, 0.05)])
-"""The touched points (n, 3) of a simulation, in m: corners of a simulated board."""
+"""The n simulated points (n, 3), in m, that the finger touches: corners of a simulated board."""
 SIMULATED_CORNER_M, SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, 1e-4, math.radians(1.0)
 """The standard deviations per axis of measured corners (m), pad positions (m) and tilts (rad)."""
 
@@ -132,9 +132,9 @@ def simulate_touches(
 
     First, the marker is measured in all orientations of `SIMULATED_TILTS_DEG`, relative to the
     usual orientation of the finger. Then the finger touches each point in the orientations with the
-    smallest uncertainty. The fit assumes that the usual orientation equals `direction_world`, so
-    the fitted offset is valid in use. A touch is omitted if the detector does not accept the
-    marker.
+    smallest uncertainty. The fit assumes that the usual orientation is the `direction_world` of the
+    scene. The fitted offset is therefore valid during normal use. A touch is omitted if the
+    detector does not accept the marker.
 
     apparatus: true parameters of the simulated hardware.
     calibration: camera parameters that the detector uses; None: the scene's parameters.
@@ -180,7 +180,7 @@ def simulate_touches(
 def _see_marker(
     camera: TwinCamera, scene: Scene, geometry: StereoGeometry, pad: Floats
 ) -> TriangulatedPoint | None:
-    """Return the marker that the detector finds in simulated images, or None if it finds no marker.
+    """Return the marker that the detector finds in simulated images, or None if it finds none.
 
     pad: position (3,) of the fingertip's pad.
     """

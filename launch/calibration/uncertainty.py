@@ -1,8 +1,9 @@
 """Compute the error of a measured fingertip that results from the uncertainty of the stereo rig.
 
 To first order, the error follows from the covariance of the rig's parameters. A delete-a-group
-jackknife repeats the fit without some pairs. It also covers errors that corners have in common, a
-warped board, and deviations from the lens model.
+jackknife repeats the fit several times, each time with some pairs omitted. It also includes the
+effects of errors that corners have in common, of a warped board, and of deviations from the lens
+model.
 """
 
 from __future__ import annotations

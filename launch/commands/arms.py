@@ -80,12 +80,13 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """Engage the software e-stop of the arms until `flexsheet arms reset`.
+    """Engage the software e-stop of the arms until you run `flexsheet arms reset`.
 
     This command does not replace the hard-wired e-stop. Without --run, it stops the arms of all
     graphs of this user on this computer.
 
-    The exit code is 0 if a launcher or an arm bridge confirms the stop, or if both arms report it.
+    The exit code is 0 if the stop is confirmed by a launcher or by a node that controls an arm. It
+    is also 0 if both arms report the stop.
     """
     from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms
@@ -140,8 +141,8 @@ def reset(
 ) -> None:
     """Reset the e-stop and the stored faults of arms that are at rest.
 
-    Arms with `arming: manual` then stay at rest until `flexsheet arms enable`. Simulated arms with
-    `arming: auto` move as soon as they receive a target.
+    If an arm has the setting `arming: manual`, it then stays at rest until you run `flexsheet arms
+    enable`. Simulated arms that have `arming: auto` move as soon as they receive a target.
     """
     from flexsheet.launch.plans.plan_model import tools_on
     from flexsheet.launch.running.tools import tools_host
@@ -265,8 +266,11 @@ def _command(
 ) -> int:
     """Publish a command to both arms, wait for its effect, and print the states of the arms.
 
-    command: topic and message; None publishes nothing. done: function that receives the arm states
-    and returns True when the command has had its effect. Returns the exit code.
+    Returns the exit code.
+
+    command: topic and message to publish; None: nothing is published.
+    done: function that receives the arm states, and returns True when the command has had its
+        effect.
     """
     plan, run = running_graph(run_directory)
 

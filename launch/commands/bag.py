@@ -313,9 +313,9 @@ def verify(
 ) -> None:
     """Run a node twice on its recorded inputs, and compare the outputs.
 
-    The exit code is 1 if the two runs differ, if the node fails, or if it cannot be replayed. The
-    exit code is 3 if the two runs are equal but differ from the recorded outputs, for example
-    because the node reads the system clock.
+    The exit code is 1 if the two runs differ, if the node fails, or if the node cannot be replayed.
+    The exit code is 3 if the two runs are equal but differ from the recorded outputs. A possible
+    reason is that the node reads the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
@@ -542,7 +542,7 @@ async def _record(
 
 
 async def _show_remaining(label: str, duration_s: float | None) -> None:
-    """Show a progress bar for a recording of limited duration; show nothing without a limit."""
+    """Show a progress bar for a recording; show nothing if its duration is not limited."""
     if duration_s is None:
         return
     loop = asyncio.get_running_loop()
@@ -566,8 +566,8 @@ async def _play(
 ) -> int:
     """Publish the messages of a bag to a running graph; return the exit code 0.
 
-    rate: playback speed relative to the recording. start_s: time in the bag at which playback
-    starts.
+    rate: playback speed relative to the recording.
+    start_s: time in the bag at which playback starts.
     """
     from flexsheet.launch.bags.player import play as play_bag
     from flexsheet.launch.bags.player import select_topics

@@ -39,11 +39,19 @@ app = typer.Typer(
 
 LeftOption = Annotated[
     str,
-    typer.Option(metavar="GLOB", help="File pattern of the left images, paired by sorted name."),
+    typer.Option(
+        metavar="GLOB",
+        help="File pattern of the left images. Left and right images are paired in the order of "
+        "their names.",
+    ),
 ]
 RightOption = Annotated[
     str,
-    typer.Option(metavar="GLOB", help="File pattern of the right images, paired by sorted name."),
+    typer.Option(
+        metavar="GLOB",
+        help="File pattern of the right images. Left and right images are paired in the order of "
+        "their names.",
+    ),
 ]
 BoardOption = Annotated[
     str,
@@ -258,9 +266,9 @@ def cross_check(
 ) -> None:
     """Cross-validate a calibration with image pairs that were not used to compute it.
 
-    The command calibrates repeatedly, each time without some of the image pairs, and measures the
-    board in these pairs. It also prints the errors of a calibration that uses OpenCV's functions
-    only.
+    The command calibrates repeatedly. Each time, it omits some of the image pairs, and then
+    measures the board in the omitted pairs. It also prints the errors of a calibration that uses
+    only OpenCV's functions.
     """
     from flexsheet.launch.calibration import check
 
@@ -306,9 +314,9 @@ def print_board(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Write an image of a calibration board for printing at true size.
+    """Write an image of a calibration board, to be printed at true size.
 
-    The board is a chessboard; with --marker-mm, it is a ChArUco board.
+    The board is a ChArUco board if --marker-mm is given. Otherwise, it is a chessboard.
     """
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
@@ -376,7 +384,7 @@ def command_line() -> str:
 
 
 def make_provenance() -> dict[str, Any]:
-    """Return the date and the code version for a calibration file."""
+    """Return the date and the code version that are written to a calibration file."""
     from importlib.metadata import version
 
     now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -386,8 +394,9 @@ def make_provenance() -> dict[str, Any]:
 def write_scene_values(scene_file: Path, values: Mapping[str, Any], copy: Path) -> None:
     """Write a copy of a scene file with other values; preserve comments and layout.
 
-    values: new values by the dotted path of the key. Raises BadInputError if the changed scene is
-    invalid.
+    values: new values by the dotted path of the key.
+
+    Raises BadInputError if the changed scene is invalid.
     """
     from ruamel.yaml.comments import CommentedSeq
 
@@ -446,8 +455,8 @@ def load_true_devices(
 ) -> Apparatus | None:
     """Load the apparatus: the true parameters of the simulated hardware.
 
-    The parameters refer to the world frame of the stereo camera, as all calibrations do. Returns
-    None if `text` is None.
+    The parameters refer to the world frame of the stereo camera, as all calibrations do. If `text`
+    is None, the result is None.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.nodes.twin.truth import align_world_to_camera

@@ -91,7 +91,7 @@ def arms(
         Path | None,
         typer.Option(
             "--write-scene",
-            help="Copy of the scene to write, with the measured base poses.",
+            help="Output file: a copy of the scene with the measured base poses.",
             callback=options.check_folder,
         ),
     ] = None,
@@ -240,8 +240,10 @@ async def record_poses(
     """Pass images and arm states of the running graph to a recorder until it has enough poses.
 
     on_arm: function that is called with each message of the topics `arms` and its arrival time (s).
-    size: required width and height of the images, px. places: number of poses. Returns the exit
-    code.
+    size: required width and height of the images, px.
+    places: number of poses.
+
+    Returns the exit code.
     """
     import asyncio
     import time
@@ -380,7 +382,7 @@ def _true_errors(
 ) -> dict[str, float]:
     """Return the true errors (m, rad) of the flange pose of a simulated, calibrated arm.
 
-    The joints are at the arm's start position; backlash is not included.
+    The errors are computed at the arm's start position. They do not include backlash.
     """
     import numpy as np
 
@@ -431,7 +433,7 @@ def _print_result(
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return the distance (m) and the angle (rad) of a calibrated base from that in the scene."""
+    """Return distance (m) and angle (rad) between a calibrated base and the base in the scene."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation

@@ -44,7 +44,10 @@ POSES = 24
 )
 def edges(
     *,
-    output: Annotated[Path, options.result_file("Copy of the scene file with the measured arms.")],
+    output: Annotated[
+        Path,
+        options.result_file("Output file: a copy of the scene with the measured arm parameters."),
+    ],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -123,9 +126,10 @@ def edges_capture(
 ) -> None:
     """Record marks on both clamps for `calibrate edges`, from the running graph.
 
-    Fix three bright marks on each clamp: one at its centre, and two at 45 % of its length above and
-    below the centre. Move the sheet to poses that differ in position, rotation and stretch. The
-    command records a pose when both arms are at rest, and stops after 24 poses or at Ctrl-C.
+    Fix three bright marks on each clamp: one at its centre, and two that are 45 % of its length
+    above and below the centre. Move the sheet to poses that differ in position, rotation and
+    stretch. The command records a pose when both arms are at rest, and stops after 24 poses or at
+    Ctrl-C.
     """
     from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene

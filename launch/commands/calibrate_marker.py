@@ -92,8 +92,9 @@ def marker(
 def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerCalibration:
     """Fit the position of the marker on the finger to touches of known points.
 
-    source: text that names the origin of the data in the calibration. Raises CommandError if the
-    touches do not determine the position.
+    source: text that names the origin of the data in the calibration.
+
+    Raises CommandError if the touches do not determine the position.
     """
     from flexsheet.launch.calibration.marker_fit import MarkerFitError, fit_marker
     from flexsheet.messages.marker_calibration import MarkerCalibration

@@ -98,11 +98,11 @@ def projector(
     seed: options.SeedOption = 1,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Calibrate pose and lens of the projector, and write the result into a scene.
+    """Calibrate the pose and the lens of the projector, and write the result into a scene.
 
     The data are stereo images of Gray-code patterns on the sheet in three or more poses
-    (--pictures) or four corners that were set manually (--corners). With --twin, the images are
-    simulated.
+    (--pictures). Alternatively, they are four corners that you have set manually (--corners). With
+    --twin, the images are simulated.
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import calibrate_projector, measure_points
@@ -186,8 +186,9 @@ def simulate_views(
 ) -> Iterator[Views]:
     """Yield the simulated left and right images of all Gray-code patterns, for each sheet pose.
 
-    true: simulated projector. apparatus: true parameters of the other simulated devices, whose arms
-    hold the sheet. If it is None, the sheet is flat and exactly at the commanded poses.
+    true: simulated projector.
+    apparatus: true parameters of the other simulated devices, including the arms that hold the
+        sheet. If it is None, the sheet is flat and exactly at the commanded poses.
     """
     from rich.progress import track
 
@@ -281,9 +282,10 @@ def _print_result(
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return mean and maximum image errors (mm) at the eye, before and after calibration.
+    """Return the mean and maximum image errors (mm) at the eye before and after calibration.
 
-    fitted: calibrated projector. true: simulated projector.
+    fitted: calibrated projector.
+    true: simulated projector.
     """
     from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 

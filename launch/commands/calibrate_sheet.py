@@ -47,7 +47,7 @@ def sheet(
         typer.Option(
             metavar="CSV",
             help="CSV file of measured pushes; columns: depth_mm, force_n, edge_distance_mm or "
-            "stretch_ratio; optional ones: docs/sheet.md.",
+            "stretch_ratio. docs/sheet.md lists optional columns.",
         ),
     ] = None,
     bag: Annotated[
@@ -90,9 +90,9 @@ def sheet(
 ) -> None:
     """Fit the force model of a sheet to the forces on a finger that pushes the sheet.
 
-    The command fits the product of Young's modulus and thickness, the width without tension, and a
-    cubic term of the force. The pushes are rows of a CSV file (--rows, --scene), come from a
-    recording with a force gauge (--bag), or are simulated (--twin).
+    The command fits the product of Young's modulus and thickness, the width of the sheet without
+    tension, and a cubic term of the force. The pushes are rows of a CSV file (--rows, --scene),
+    come from a recording with a force gauge (--bag), or are simulated (--twin).
     """
     from flexsheet.launch.calibration.sheet_bag import read_pushes
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
@@ -151,8 +151,10 @@ def make_calibration(
 ) -> SheetCalibration:
     """Fit the force model of the sheet to measured pushes, and return the calibration.
 
-    lines: line number of each push in its file. with_prior: as in `fit_sheet_model`. Raises
-    SheetModelFitError if the pushes do not determine the parameters.
+    lines: line number of each push in its file.
+    with_prior: as in `fit_sheet_model`.
+
+    Raises SheetModelFitError if the pushes do not determine the parameters.
     """
     from functools import partial
 
@@ -235,7 +237,7 @@ def simulate_pushes(
 ) -> list[MeasuredPush]:
     """Simulate measured pushes on the sheet of a scene.
 
-    places: push the whole sheet instead of only its centre.
+    places: whether to push at points all over the sheet, not only at its centre.
     """
     from flexsheet.launch.calibration.sheet_rows import simulate_rows
 

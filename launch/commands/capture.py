@@ -32,8 +32,9 @@ POSES_PER_PAIR = 3
 def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
     """Yield grey image pairs of a real camera.
 
-    source: YAML text, as in the parameter `source` of a camera node. Raises CommandError if the
-    source is invalid, and DeviceError if the device fails.
+    source: YAML text, as in the parameter `source` of a camera node.
+
+    Raises CommandError if the source is invalid, and DeviceError if the device fails.
     """
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
@@ -129,7 +130,7 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
 
 @contextmanager
 def _show_coverage(capture: Capture) -> Iterator[Any]:
-    """Show the coverage of board poses, and yield its update function (hint, accepted).
+    """Show the coverage of board poses, and yield a function (hint, accepted) that updates it.
 
     If stderr is not a terminal, one line is printed for each accepted pair.
     """

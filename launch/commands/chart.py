@@ -108,7 +108,7 @@ def chart(
     """Measure the computing time and error of the methods in a method family, and draw a chart.
 
     For each method, the command prints the maximum of the median times and of the errors over all
-    cases that the method supports. "front" marks a method if no other method is both faster and
+    cases that the method supports. A method is marked "front" if no other method is both faster and
     more accurate. `system` measures whole graphs instead. To continue an interrupted measurement of
     `system`, repeat the command with the same --output.
     """
@@ -173,7 +173,7 @@ def _report(progress: Callable[[str], None], family: str, text: str) -> None:
 def _measure_system(measure: Callable[..., dict[str, Any]], image: Path, *, as_json: bool) -> None:
     """Measure graph configurations, and write the results and a chart.
 
-    measure: function that measures and reports its progress to a given function.
+    measure: function that measures, and reports its progress to the function that it receives.
     """
     import json
 

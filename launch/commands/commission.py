@@ -97,7 +97,7 @@ def commission(
         typer.Option(
             "--step",
             metavar="STEP",
-            help="Step to run again, with all later steps; repeat the option for several.",
+            help="Step to run again, with all later steps; repeat the option for several steps.",
         ),
     ] = None,
     skipped: Annotated[
@@ -199,7 +199,7 @@ def _parse_step(option: str, text: str) -> StepName:
 def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
     """Return the texts by step from the values STEP=TEXT of a command-line option.
 
-    Raises CommandError for an unknown step or an empty text.
+    Raises CommandError if a step is unknown or a text is empty.
     """
     pairs = {}
     for one in given or ():

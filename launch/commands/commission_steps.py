@@ -115,8 +115,11 @@ def open_laboratory(
 ) -> tuple[Commissioning, Laboratory]:
     """Open the folder of a commissioning; return its state and its devices.
 
-    For simulated devices, the true parameters are written to an apparatus file in the folder.
-    apparatus: apparatus file or seed; None for real devices. options: fields of `Laboratory`.
+    If the devices are simulated, their true parameters are written to an apparatus file in the
+    folder.
+
+    apparatus: apparatus file or seed; None for real devices.
+    options: fields of `Laboratory`.
     """
     plan = load_graph(launch_file)
     if plan.scene_file is None:
@@ -136,10 +139,13 @@ class Laboratory:
     """The devices of one laboratory: simulated devices, or files with the data of real devices.
 
     apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
-    devices. data: file or folder with the captured data, by step. finger_radius_m: measured radius
-    of the fingertip, for real devices. sheet_kg_per_m2: measured mass per area of a real sheet.
-    seconds: duration of the stroke in the verification. simulated_time: verify simulated devices
-    without a running graph. pairs, arm_poses, sheet_poses: numbers of simulated observations.
+        devices.
+    data: file or folder with the captured data, by step.
+    finger_radius_m: measured radius of the fingertip, for real devices.
+    sheet_kg_per_m2: measured mass per area of a real sheet.
+    seconds: duration of the stroke in the verification.
+    simulated_time: whether to verify simulated devices in simulated time, without a running graph.
+    pairs, arm_poses, sheet_poses: numbers of simulated image pairs, arm poses and sheet poses.
     """
 
     apparatus: Apparatus | None
@@ -180,7 +186,10 @@ class Laboratory:
 
     @contextmanager
     def _folder(self, step: StepName) -> Iterator[Path]:
-        """Yield the folder with the captured data, or a temporary folder for simulated data."""
+        """Yield the folder with the captured data of a step.
+
+        If the data are simulated, this is a temporary folder.
+        """
         if self.apparatus is None:
             yield self._find_data(step)
             return
@@ -188,7 +197,7 @@ class Laboratory:
             yield Path(folder)
 
     def _load(self, lab: Commissioning) -> tuple[Scene, StereoCalibration | None]:
-        """Load the scene, and the stereo calibration if the step camera is finished."""
+        """Load the scene, and also the stereo calibration if the step `camera` is finished."""
         stereo = lab.find_file(STEREO)
         return load_scene(lab.scene_copy), None if stereo is None else load_calibration(stereo)
 
@@ -516,10 +525,10 @@ class Laboratory:
     def _measure_display_latency(
         self, scene: Scene, graph: ResolvedGraph, stamp: MeasuredLag | None, added_s: float
     ) -> MeasuredLag:
-        """Measure the time from the swap of a frame to the middle of its display.
+        """Measure the time from the buffer swap of a frame to the middle of its display.
 
-        stamp: measured offset of the camera's timestamps; None if it is unknown. added_s:
-        correction of this offset that the timestamps in the data already contain, s.
+        stamp: measured offset of the camera's timestamps; None if it is unknown.
+        added_s: correction (s) of this offset that the timestamps in the data already contain.
         """
         from flexsheet.launch.calibration.delays import MeasuredLag
         from flexsheet.launch.calibration.display_latency import (
@@ -625,10 +634,13 @@ def collect_knowledge(lab: Commissioning) -> Knowledge:
 def run_verification(
     lab: Commissioning, seconds: float, seed: int, *, simulated_time: bool
 ) -> dict[str, Any]:
-    """Measure the true errors of a simulated laboratory in a stroke, at rest and in motion.
+    """Measure the true errors of a simulated laboratory, both during a stroke and at rest.
 
-    seconds: duration of the stroke. simulated_time: run the stroke without a graph, and omit the
-    self-checks and the errors before calibration. Raises VerificationError if the stroke fails.
+    seconds: duration of the stroke.
+    simulated_time: whether to run the stroke in simulated time, without a graph. If true, the
+        self-checks and the errors before calibration are omitted.
+
+    Raises VerificationError if the stroke fails.
     """
     from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
     from flexsheet.launch.experiments.maps import draw_cross_errors
@@ -716,11 +728,14 @@ def describe_sheet(
 ) -> dict[str, float]:
     """Return the scene values of a measured sheet, by their dotted paths.
 
-    The flange compliances are scaled by the ratio of the tensions of the scene's sheet and the
-    measured sheet. The tension then displaces the flanges as far as the step `edges` measured.
+    The flange compliances are multiplied by the tension of the scene's sheet and divided by the
+    tension of the measured sheet. The tension then displaces the flanges as far as the step `edges`
+    measured.
 
-    modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
-    tension. mass_kg_per_m2: mass per area, from which the density is computed; None omits it.
+    modulus_thickness_n_per_m: product of Young's modulus and thickness.
+    width_m: width without tension.
+    mass_kg_per_m2: mass per area, from which the density is computed; None: the result contains no
+        density.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 
 def _keys_of(module: str, name: str) -> Callable[[str], list[str]]:
-    """Return a function that completes the keys of a table, which is a variable of a module."""
+    """Return a function that completes the keys of a dictionary.
+
+    The dictionary is the variable `name` of a module.
+    """
 
     def complete(incomplete: str) -> list[str]:
         return _filter(getattr(import_module(module), name), incomplete)

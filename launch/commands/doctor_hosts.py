@@ -84,7 +84,7 @@ def hosts(
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
     """Check the hosts of the running graph; return an empty list if no graph is running.
 
-    For a graph on one host, only the findings of the nodes' self-checks are returned.
+    If the graph runs on one host, only the findings of the nodes' self-checks are returned.
     """
     from flexsheet.launch.health.doctor_hosts import SELF_CHECK
     from flexsheet.launch.running.runs import list_live_runs
@@ -100,7 +100,7 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved graph and its run on this computer, or None if it is not running.
+    """Return the resolved graph, and its run on this computer or None if the graph is not running.
 
     If `launch_file` is None, the newest running graph is used.
     """
@@ -120,8 +120,10 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
 def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
     """Return the name of this computer among the hosts of a graph.
 
-    requested: name given by the user, or None. Raises CommandError if the name is unknown, or if
-    the addresses of this computer do not determine it.
+    requested: name given by the user, or None.
+
+    Raises CommandError if the name is unknown, or if the addresses of this computer do not
+    determine its name.
     """
     from flexsheet.launch.health.doctor_hosts import list_own_addresses
     from flexsheet.launch.plans.documents import did_you_mean

@@ -44,7 +44,7 @@ def graph(
 ) -> None:
     """Print or draw the nodes of a graph, and the topics between them.
 
-    Topics that any number of nodes may publish, such as estop and status, are omitted.
+    Topics that any number of nodes can publish, such as estop and status, are omitted.
     """
     from flexsheet.launch.plans.drawing import lay_out, list_links, mermaid, svg, text_lines
     from flexsheet.launch.plans.plan import load_graph

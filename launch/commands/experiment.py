@@ -107,8 +107,9 @@ def stroke(
     without: Annotated[
         list[Feature] | None,
         typer.Option(
-            help="Part of the display to omit: the projected image or the rendered force. Without "
-            "the image, frame latencies are null. Not with several strokes or variants."
+            help="Part of the display to omit: the projected image or the rendered force. If the "
+            "image is omitted, frame latencies are null. The option cannot be combined with "
+            "several strokes or variants."
         ),
     ] = None,
     switches: Annotated[
@@ -118,7 +119,7 @@ def stroke(
             max=1000,
             help="Number of switches of the projected image between white and black after the "
             "stroke, for the latency of the projector. The bag then contains the images of the "
-            "camera. Not with several strokes.",
+            "camera. The option cannot be combined with several strokes.",
         ),
     ] = 0,
     output: options.ResultFolderOption = None,
@@ -284,8 +285,8 @@ def compliance(
         bool,
         typer.Option(
             "--complete-table",
-            help="Wait for the complete table of the soft body; otherwise the pushes begin with "
-            "the coarse table, if the complete one is not in the cache.",
+            help="Wait for the complete table of the soft body. Otherwise, the pushes begin with "
+            "the coarse table if the complete table is not in the cache.",
         ),
     ] = False,
     output: options.ResultFolderOption = None,
@@ -357,7 +358,8 @@ def _measure_images(
 ) -> None:
     """Run an image experiment in a graph, record it in a bag, and print the image errors.
 
-    with_table: before the experiment, wait until the table of the soft body is computed.
+    with_table: whether to wait, before the experiment, until the table of the soft body is
+        computed.
     """
     from flexsheet.launch.experiments import image
     from flexsheet.launch.experiments.maps import draw_error_maps
@@ -447,7 +449,7 @@ def gestures(
 
 
 def _print_gestures(results: list[dict[str, Any]]) -> None:
-    """Print a table of tracking errors (mm) and delays (ms), one line per gesture."""
+    """Print a table of tracking errors (mm) and delays (ms), with one line per gesture."""
     columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
     for each in results[0]["prediction"][1:]:
         columns += [f"+{each['horizon_ms']:.0f} ms rms", "lag, ms"]
@@ -464,9 +466,10 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
-    """Print the errors with which the sheet followed the finger, one line per fingertip path.
+    """Print the errors of the sheet while it followed the finger, with one line per fingertip path.
 
-    Δd and Δθ are the distance and the angle between the true sheet and the true finger in contact.
+    Δd and Δθ are the distance and the angle between the true sheet and the true finger during
+    contact.
     """
 
     columns = ["path", "in contact", "followed", "drop-outs", "true Δd, mm: mean", "95 %", "max"]
@@ -553,7 +556,7 @@ def stability(
         bool,
         typer.Option(
             "--graph",
-            help="With --gestures: run the graph, with the hand of the apparatus. Without it, the "
+            help="With --gestures: run the graph, with the hand of the apparatus. By default, the "
             "gestures run in simulated time.",
         ),
     ] = False,

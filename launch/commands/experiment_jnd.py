@@ -1,5 +1,4 @@
-"""`flexsheet experiment jnd`: measure the smallest stiffness difference that a participant
-feels."""
+"""`flexsheet experiment jnd`: measure the smallest stiffness difference that a person feels."""
 
 from __future__ import annotations
 
@@ -68,8 +67,8 @@ def jnd(
         typer.Option(
             min=1,
             max=1000,
-            help="With --simulated-participant: number of participants; the first has the seed "
-            "--seed, the next ones the following seeds. Seeds 0-99 are for development.",
+            help="With --simulated-participant: number of participants. The first has the seed of "
+            "--seed, and the others have the following seeds. Seeds 0-99 are for development.",
         ),
     ] = 1,
     launch_file: options.LaunchOption = options.DEMO,
@@ -212,7 +211,8 @@ def _write_result(row: dict[str, Any], folder: Path) -> None:
 def _summarize(rows: list[dict[str, Any]], reference_pa: float) -> dict[str, Any]:
     """Return the JSON output of `flexsheet experiment jnd`.
 
-    rows: one row per participant. reference_pa: Young's modulus of the reference object.
+    rows: one row per participant.
+    reference_pa: Young's modulus of the reference object.
     """
     import numpy as np
 

@@ -161,9 +161,9 @@ def sensitivity(
 ) -> None:
     """Measure the errors that each hardware parameter causes if only this parameter is inaccurate.
 
-    Each parameter deviates by 1 and 3 standard deviations in both directions. Delays and tremor
-    are evaluated by strokes in simulated time, all others with the sheet at rest. To continue an
-    interrupted command, repeat it with the same --output.
+    Each parameter deviates by 1 and 3 standard deviations in both directions. Delays and tremor are
+    evaluated by strokes in simulated time. All other parameters are evaluated with the sheet at
+    rest. To continue an interrupted command, repeat it with the same --output.
     """
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment

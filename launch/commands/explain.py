@@ -1,6 +1,6 @@
 """`flexsheet explain`: print the meaning and the remedy of an error or of a node's note.
 
-A note is a short text in a node's status that describes a problem of the node.
+A note is a short text in a node's status. It describes a problem of the node.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ class NoGraphError(CommandError):
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
-    """Return the resolved graph and the run of a run directory.
+    """Return the resolved graph and the run that belong to a run directory.
 
     If `directory` is None, the newest running graph is used. Raises CommandError if the directory
     contains no plan, and NoGraphError if no graph is running.

@@ -88,8 +88,8 @@ def launch(
 ) -> None:
     """Start the nodes of a launch file and supervise them until Ctrl-C.
 
-    With --json, the command prints one line about the run when all nodes are ready. With --json and
-    --dry-run, it prints the resolved graph.
+    If --json is given, the command prints one line about the run when all nodes are ready. If
+    --dry-run is also given, it prints the resolved graph instead.
 
     The exit code is 0 if the graph was stopped on request, 1 if a node failed, and 2 if the input
     is invalid.
@@ -129,14 +129,14 @@ def launch(
 
 
 def page_url(console: ResolvedNode) -> str:
-    """Return the URL of a console's page; the console node must have a fixed port."""
+    """Return the URL of a console's page. The console node must have a fixed port."""
     address = console.parameters["address"]
     host = f"[{address}]" if ":" in address else address
     return f"http://{host}:{console.parameters['page_port']}/"
 
 
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
-    """Return run directory, plan hash and node names of a graph, for JSON output.
+    """Return the run directory, plan hash and node names of a graph, for JSON output.
 
     host: host whose nodes are listed; None for all hosts.
     """
@@ -155,7 +155,7 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """Check in a thread whether sheet and hand may oscillate, if the planner runs on `host`."""
+    """If the planner runs on `host`, check in a thread whether sheet and hand may oscillate."""
     if any(
         issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
     ):
@@ -163,7 +163,7 @@ def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
-    """Print the nodes that the graph omits, and the reason for each omission.
+    """Print the omitted nodes of a graph, and the reason for each omission.
 
     host: host whose nodes are printed; None for all hosts.
     """
@@ -186,8 +186,9 @@ async def run_graph(
 
     The second signal logs the nodes that have not exited, and the third signal kills these nodes.
 
-    duration_s: maximum time after all nodes are ready; None for no limit. without: names of nodes
-    that are not started. when_ready: function that is called when all nodes are ready.
+    duration_s: maximum time after all nodes are ready; None for no limit.
+    without: names of nodes that are not started.
+    when_ready: function that is called when all nodes are ready.
     """
     from flexsheet.launch.running.supervisor import RunningGraph
 
@@ -283,7 +284,7 @@ def format_log_line(line: str) -> tuple[str, str]:
 
 
 def _format_settings(node: ResolvedNode) -> str:
-    """Return "name=value" for all parameters of a node that differ from their defaults."""
+    """Return "name=value" for each parameter of a node that differs from its default."""
     from pydantic_core import to_jsonable_python
 
     from flexsheet.nodes.node import find_parameters_type

@@ -57,7 +57,8 @@ def info(
 ) -> None:
     """Print the ports, timers and parameters of a node or of a node type.
 
-    For a node of the running graph, the connected topics and the parameter values are also printed.
+    If the node is in the running graph, the command also prints its connected topics and its
+    parameter values.
     """
     from flexsheet.messages.field_types import describe_field
     from flexsheet.nodes import UnknownNodeError, node_class

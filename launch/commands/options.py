@@ -42,7 +42,7 @@ The former names still work, but the help does not show them.
 
 
 def make_app(text: str | None = None) -> typer.Typer:
-    """Create the typer app of a command without a group, or of a command group with a help text.
+    """Create the typer app of a single command, or of a command group with a help text.
 
     text: help of the group; None for a single command.
     """
@@ -50,7 +50,7 @@ def make_app(text: str | None = None) -> typer.Typer:
 
 
 def find_launch_file(given: Path | None) -> Path | None:
-    """Return the path of a launch file; None if `given` is None.
+    """Return the path of a launch file, or None if `given` is None.
 
     given: path, or name of a launch file in the package.
     """
@@ -58,7 +58,7 @@ def find_launch_file(given: Path | None) -> Path | None:
 
 
 def find_scene(given: Path | None) -> Path | None:
-    """Return the path of a scene file; None if `given` is None.
+    """Return the path of a scene file, or None if `given` is None.
 
     given: path, or name of a scene in the package.
     """
@@ -103,8 +103,8 @@ ApparatusOption = Annotated[
         "--apparatus",
         metavar="FILE|seed:N",
         help="File with the true parameters of the simulated hardware, or a random sample such as "
-        "seed:7. seed:7,paper has older equipment, and seed:7,calibrated only the errors that "
-        "remain after calibrations. Default: the parameters of the scene.",
+        "seed:7. seed:7,paper simulates older equipment. seed:7,calibrated contains only the "
+        "errors that remain after calibrations. Default: the parameters of the scene.",
     ),
 ]
 TwinApparatusOption = Annotated[
@@ -211,7 +211,8 @@ SeedOption = Annotated[
 def output_file(text: str, metavar: str = "FILE", **settings: Any) -> Any:
     """Return the declaration of the option -o/--output.
 
-    text: help of the option. metavar: placeholder of the value in the help.
+    text: help of the option.
+    metavar: placeholder of the value in the help.
     """
     return typer.Option("-o", "--output", metavar=metavar, help=text, **settings)
 
@@ -234,9 +235,9 @@ def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
 
 
 def split_names(given: list[str] | None) -> list[str]:
-    """Return the values of a repeated option; split values in the former format "A,B".
+    """Return the values of a repeated option, and split values in the former format "A,B".
 
-    Raises BadParameter if the option is given without a name.
+    Raises BadParameter if the option is given but contains no name.
     """
     names = [name.strip() for one in given or () for name in one.split(",") if name.strip()]
     if given and not names:
@@ -250,7 +251,7 @@ _VALUE_NAMES = {"str": "TEXT", "int": "N", "float": "NUMBER", "Path": "FILE", "l
 def name_values(command: Any) -> None:
     """Set the placeholders that the help shows for the values of a command's options.
 
-    Options without a value (flags) get no placeholder.
+    Options that have no value (flags) get no placeholder.
     """
     help_option = command.get_help_option(SimpleNamespace(help_option_names=["-h", "--help"]))
     for parameter in (*command.params, help_option):

@@ -25,7 +25,7 @@ FAILED, BAD_INPUT, NOT_GOOD = 1, 2, 3
 good."""
 
 PROGRESS_LINE_S = 2.0
-"""The minimum time (s) between two lines with the progress, if stderr is not a terminal."""
+"""The minimum time (s) between two printed progress lines if stderr is not a terminal."""
 
 
 class CommandError(FlexsheetError):
@@ -138,8 +138,9 @@ def print_columns(
 def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool, digits: int = 4) -> None:
     """Print rows with the same keys on stdout, as JSON or as a table.
 
-    In a table, None is shown as "-", and truth values as "yes" or "no". digits: number of
-    significant digits in a table.
+    In a table, None is shown as "-", and truth values are shown as "yes" or "no".
+
+    digits: number of significant digits in a table.
     """
     if as_json:
         print_json(rows)
@@ -185,7 +186,7 @@ def _print_folded(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None
 
 
 def print_fields(rows: Iterable[tuple[str, object]]) -> None:
-    """Print names and values on stdout, one pair per line."""
+    """Print names and values on stdout, with one pair per line."""
     pairs = [(name, str(value)) for name, value in rows]
     width = max(len(name) for name, _ in pairs)
     for name, value in pairs:
@@ -193,13 +194,17 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
 
 
 SHOWN_UNITS = {"m": (1e3, "mm"), "m/N": (1e6, "µm/N"), "rad": (math.degrees(1.0), "°")}
-"""The factor and the unit of printed values, by SI unit; other units are not converted."""
+"""The factor and the unit of printed values, by SI unit.
+
+Values in other units are not converted.
+"""
 
 
 def print_result(result: Mapping[str, Any], *, as_json: bool) -> None:
     """Print a result on stdout, as JSON or as one line for each of its values.
 
-    In the lines, lengths are in mm, angles are in degrees, and missing values are omitted.
+    If the result is printed as lines, lengths are in mm and angles are in degrees. Missing values
+    are then omitted.
     """
     if as_json:
         print_json(result)
@@ -210,9 +215,9 @@ def print_result(result: Mapping[str, Any], *, as_json: bool) -> None:
 def _list_values(
     values: Mapping[str, Any], prefix: str = "", outer_unit: str = ""
 ) -> Iterator[tuple[str, str]]:
-    """Yield label and text of all values.
+    """Yield the label and the text of each value.
 
-    The unit of a value is the suffix of its name, or `outer_unit` for a name without unit.
+    The unit of a value is the suffix of its name. If the name has no unit, it is `outer_unit`.
     """
     for name, value in values.items():
         suffix = next((one for one in UNITS if name.endswith(one)), "")
@@ -252,10 +257,11 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on stderr, and yield its update function (done, total, text).
+    """Show a progress bar on stderr, and yield a function (done, total, text) that updates it.
 
-    The optional text replaces the label in a terminal. If stderr is not a terminal, lines with the
-    progress are printed: one for every 5 %, and at most one in PROGRESS_LINE_S seconds.
+    The optional text replaces the label in a terminal. If stderr is not a terminal, the progress is
+    printed in lines. There is one line for every 5 %, but at most one line in PROGRESS_LINE_S
+    seconds.
     """
     if not words.is_terminal:
         printed_s, printed = time.monotonic(), 0.0

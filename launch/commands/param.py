@@ -170,7 +170,9 @@ def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, d
 async def _await_statuses(
     plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
 ) -> int:
-    """Store the changed parameters by node and name until `done` returns True.
+    """Store the changed parameters in `found` until `done` returns True.
+
+    The parameters are stored by node and name.
 
     Returns 0, or 1 on a timeout.
     """

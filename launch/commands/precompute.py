@@ -43,7 +43,7 @@ def precompute(
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the deflection shapes of a scene's sheet, unless the cache already contains them.
+    """Compute the deflection shapes of a scene's sheet if the cache does not contain them.
 
     The renderer draws a pushed sheet with these shapes. If the scene sets `sheet_force: table`, the
     force table is also computed, which takes about two minutes. Experiments and the demo compute

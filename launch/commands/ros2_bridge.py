@@ -17,7 +17,7 @@ app = options.make_app()
 
 
 class ExternalTopic(StrEnum):
-    """The topics that ROS nodes may publish for flexsheet."""
+    """The topics that ROS nodes can be allowed to publish for flexsheet."""
 
     EYE = "eye"
     FINGERTIP = "fingertip"

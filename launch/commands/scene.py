@@ -60,7 +60,7 @@ def export(
     form: Annotated[
         Literal["urdf", "gltf"] | None,
         typer.Option(
-            "--format", metavar="urdf|gltf", help="Format; default: that of the file name."
+            "--format", metavar="urdf|gltf", help="Format; default: determined by the file name."
         ),
     ] = None,
     output: Annotated[

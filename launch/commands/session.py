@@ -56,7 +56,7 @@ NodeArgument = Annotated[
 
 @status_app.command(epilog=examples("flexsheet status", "flexsheet status --json"))
 def status(run: options.RunOption = None, as_json: options.JsonOption = False) -> None:
-    """Show the nodes of the running graph with their message rates, lost messages and notes.
+    """Show the nodes of the running graph, with their message rates, lost messages and notes.
 
     If messages were skipped or lost, a line under the table explains whether this matters.
 
@@ -123,7 +123,10 @@ async def _collect_statuses(
 
 
 def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
-    """Return a table row with the status of a node, or with None if its status is unknown."""
+    """Return a table row with the status of a node.
+
+    If the status is unknown, the values of the row are None.
+    """
     row: dict[str, Any] = {"node": node.name, "host": node.host}
     if status is None:
         unknown = dict.fromkeys(("cpu", "memory_mb", "skipped", "lost"))
@@ -245,7 +248,7 @@ def _newest_run(directory: Path | None) -> Run:
 
 
 def _further_lines(text: Any, run: Run) -> Iterator[str]:
-    """Yield the lines that are added to an open log file until its run ends."""
+    """Yield the lines that are added to an open log file until the run ends."""
     part = ""
     while True:
         alive = run.is_alive()

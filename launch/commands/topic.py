@@ -213,7 +213,8 @@ def delay(
     """Measure the age of a topic's data when a message arrives at this command.
 
     The age is the time since the source timestamp, for instance since the exposure of an image.
-    Messages with timestamps of another computer are ignored, because its clock may differ.
+    Messages with timestamps of another computer are ignored, because the clock of that computer can
+    differ.
     """
     from flexsheet.messages.clock import SystemClock
 
@@ -255,7 +256,7 @@ def pub(
 ) -> None:
     """Publish a message to the running graph.
 
-    The topic must allow several writers, or be listed under `external_topics` in the launch file.
+    The topic must allow several writers, or the launch file must list it under `external_topics`.
     Subscribers that connect later receive a message of a latched topic only while this command
     runs.
     """
@@ -309,7 +310,7 @@ def _by_writer(arrivals: Sequence[Arrival]) -> list[list[Arrival]]:
 
 
 def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the rate, the lost messages and the publication intervals (ms), one row per writer."""
+    """Return the rate, lost messages and publication intervals (ms), with one row per writer."""
     import numpy as np
 
     rows = []
@@ -332,7 +333,7 @@ def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the bandwidth (bytes per second) and the message sizes, one row per writer."""
+    """Return the bandwidth (bytes per second) and the message sizes, with one row per writer."""
     rows = []
     for own in _by_writer(arrivals):
         sizes = [one.size_bytes for one in own]
@@ -351,7 +352,7 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return statistics of the age (ms) of the data at arrival, one row per writer."""
+    """Return statistics of the age (ms) of the data at arrival, with one row per writer."""
     rows = []
     for own in _by_writer(arrivals):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
@@ -361,7 +362,7 @@ def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def _summarize(values: list[float]) -> dict[str, float] | None:
-    """Return the median, 99 % quantile and maximum; None if there are no values."""
+    """Return the median, 99 % quantile and maximum, or None if there are no values."""
     import numpy as np
 
     if not values:
@@ -376,7 +377,7 @@ def _summarize(values: list[float]) -> dict[str, float] | None:
 def to_plain(value: Any, *, full: bool) -> Any:
     """Convert a message or field to JSON types.
 
-    full: return long arrays completely instead of a summary.
+    full: whether long arrays are returned completely instead of as a summary.
     """
     import numpy as np
     from pydantic import BaseModel
@@ -515,7 +516,9 @@ def make_listener(
 ) -> Subscriber:
     """Create a subscriber to a topic of the running graph.
 
-    raw: pass encoded messages to the handler. Raises CommandError if no node publishes the topic.
+    raw: whether to pass encoded messages to the handler.
+
+    Raises CommandError if no node publishes the topic.
     """
     from flexsheet.launch.running.tools import make_subscriber
 

@@ -80,10 +80,10 @@ def tune(
 
     The command measures each method family on this computer over the working range of the scene.
     This takes seconds to minutes. Then the command predicts the errors of combined methods, and
-    tests the fastest promising configuration in a graph. An accepted configuration meets all
-    tolerances, including those of latency and force. With --family, the command chooses only the
-    methods of these families, each separately. Nodes use the chosen method if their parameter is
-    `auto`. The exit code is 3 if a tolerance is not met.
+    tests the fastest promising configuration in a graph. A configuration is accepted if it meets
+    all tolerances, including the tolerances of latency and force. If --family is given, the command
+    chooses only the methods of these families, and chooses each one separately. Nodes use the
+    chosen method if their parameter is `auto`. The exit code is 3 if a tolerance is not met.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune

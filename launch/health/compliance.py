@@ -46,11 +46,11 @@ LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 FINGERTIP_AGE_S = 0.012
 """The assumed age (s) of a fingertip position when it is published.
 
-It consists of half an exposure, the read-out of the camera, and the computation.
+It is the sum of half an exposure, the read-out time of the camera, and the computing time.
 """
 
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""The push depths that the report lists, as fractions of the maximum push depth."""
+"""The push depths that the report lists, divided by the maximum push depth."""
 
 
 def compute_front_curve(
@@ -59,14 +59,15 @@ def compute_front_curve(
     *,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Floats:
-    """Return the force of the object on the side that faces the user, as a function of push depth.
+    """Return the force of the object as a function of push depth, on the side that faces the user.
 
     The result has rows (n, 2) of depth (m) and force (N). The linear method is used only if the
     scene chooses it. Otherwise, the nonlinear table of the object is used. If this table is not
     cached, its computation takes minutes.
 
     cache_dir: folder of the cache; None: the user's cache folder.
-    on_progress: function that is called with the numbers of finished and of all steps.
+    on_progress: function that is called with the number of finished steps and the number of all
+        steps.
     """
     factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
@@ -96,7 +97,7 @@ def compute_compliance(
     law: force model of the sheet.
     curve: force of the object as a function of push depth.
     max_depth_m: maximum push depth; None: the depth in the scene.
-    bounds: limits of the offset that keep the control loop of sheet and hand stable; None: no
+    bounds: limits within which the offset keeps the control loop of sheet and hand stable; None: no
         limits.
     """
     limits = make_stretch_limits(scene.sheet, law, bounds)
@@ -107,8 +108,9 @@ class LoopRisk(StrEnum):
     """The risk that the control loop of sheet and hand is unstable or renders a wrong force.
 
     OSCILLATION: a hand of low damping can oscillate, because the sheet moves away too late.
-    DELAY: because of the delay, the sheet cannot render the object's force with a stable offset.
-    SHEET: the sheet cannot render the object's force, even without delay.
+    DELAY: because of the delay, the sheet cannot render the object's force within the stability
+        limits.
+    SHEET: the sheet cannot render the object's force, even if there is no delay.
     """
 
     OSCILLATION = "oscillation"
@@ -157,7 +159,9 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return the risk of the control loop of sheet and hand at a given delay, or None without risk.
+    """Return the risk of the control loop of sheet and hand at a given delay.
+
+    Return None if there is no risk.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.
@@ -176,11 +180,11 @@ def find_loop_risk(
 
 
 def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
-    """Return the risk of the control loop of sheet and hand, before a graph of nodes starts.
+    """Return the risk of the control loop of sheet and hand before a graph of nodes starts.
 
     The parameters of the planner determine the delay. Only cached data are used, because their
-    computation takes up to minutes. Return None if there is no risk, or if the stability limits or
-    the soft body are not cached. In the second case, the planner reports the risk later.
+    computation can take minutes. Return None if there is no risk. Return None also if the stability
+    limits or the soft body are not cached; the planner then reports the risk later.
     """
     scene = plan.scene_message()
     planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")

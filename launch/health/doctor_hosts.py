@@ -1,7 +1,7 @@
 """Evaluate the probes of hosts, and return findings with remedies.
 
 A probe (`launch.health.probe`) contains the messages from one host. Each check of a host gives one
-finding. Further findings are from checks of this computer.
+finding. Checks of this computer give further findings.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
         "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
     ),
 }
-"""The texts of finding and remedy for each reason why a host cannot be reached."""
+"""The texts of the finding and the remedy for each reason why a host cannot be reached."""
 
 LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.CLOSED: (
@@ -300,7 +300,7 @@ def _check_clocks(
 ) -> HostFinding:
     """Check that the clock offsets from a host to the other hosts are known accurately enough.
 
-    The limit is that of the clock node in the graph.
+    The limit of the uncertainty is set by the clock node of the graph.
     """
     finding = partial(HostFinding, probe.host, "clocks")
     if probe.clocks is None:
@@ -398,7 +398,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; {OPENGL_REMEDY}",
     ),
 }
-"""The name and the remedy of the check that a node publishes messages, by the role of the node."""
+"""The name and the remedy of the check whether a node publishes messages, by role of the node."""
 
 
 def _report_devices(
@@ -506,7 +506,9 @@ def _shorten(texts: Sequence[str]) -> list[str]:
 
 
 def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
-    """Return why the key of this computer cannot be used to connect to hosts, or None if it can.
+    """Return why the key of this computer cannot be used to connect to hosts.
+
+    Return None if the key can be used.
 
     here: name of this computer in the launch file.
     """
@@ -579,7 +581,10 @@ def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
-    """Check that the controller of an arm accepts connections. No graph may be running."""
+    """Check that the controller of an arm accepts connections.
+
+    This function must be called only if no graph is running.
+    """
     finding = partial(HostFinding, here, f"arm {node.arm_side}")
     if node.device_address is None:
         return finding("not asked", f"{node.name} uses its own driver")

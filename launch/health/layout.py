@@ -1,10 +1,10 @@
 """Check whether two arms reach the whole working range of a scene, and suggest remedies.
 
 The range is sampled over contact points on the object, sheet poses, push depths, stretches and
-motions. Some sheet poses result from rolling, which tilts the sheet over the object without slip,
-so that the contact also moves on the sheet. The sheet poses follow the rules of the planner
-(`flexsheet.nodes.planner.rolling`). The reach of an arm follows the rules of its control node
-(`flexsheet.nodes.arm_bridge.reach`).
+motions. Some sheet poses result from rolling. In this motion, the sheet tilts over the object
+without slip, so that the contact also moves on the sheet. The sheet poses follow the rules of the
+planner (`flexsheet.nodes.planner.rolling`). The reach of an arm follows the rules of its control
+node (`flexsheet.nodes.arm_bridge.reach`).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
 """The maximum differences between two duplicate contacts: position (m) and unit normal."""
 
 ROLL_STARTS = 24
-"""The approximate number of contacts from which the sheet is rolled to other contacts."""
+"""The approximate number of contacts from which the sheet rolls to other contacts."""
 
 CLAMP_MARGIN_M = 0.03
 """The minimum distance (m) between the finger and a clamped edge of the sheet."""
@@ -74,7 +74,7 @@ REACHED_COLOR = "#dcefdc"
 THINNED_COUNT = 600
 """The approximate number of samples with which a base position is checked first.
 
-All samples are checked only for a base position from which the arm reaches these samples.
+All samples are checked only if the arm reaches these samples from the base position.
 """
 
 
@@ -85,7 +85,8 @@ class ContactSample:
     tilt_rad: angle between the surface normal and the direction towards the user, positive upwards.
     contact_world_m: contact point (3,).
     world_from_sheet: pose of the sheet (4, 4).
-    twists_world: velocities (k, 6) of the sheet for strokes at the working speed, m/s and rad/s.
+    twists_world: velocities (k, 6) of the sheet during k strokes at the working speed, m/s and
+        rad/s.
     """
 
     tilt_rad: float
@@ -111,7 +112,7 @@ class LayoutSamples:
 
 @dataclass(frozen=True, slots=True)
 class LayoutRemedy:
-    """A change of the scene after which the arms reach the whole working range.
+    """A change of the scene that makes the whole working range reachable for both arms.
 
     what: description of the change.
     values: changed values by name.
@@ -172,10 +173,10 @@ class Layout:
 def sample_contacts(scene: Scene) -> list[ContactSample]:
     """Sample contact points on the object, with sheet poses at each point.
 
-    The object is viewed from all directions within the scene's tilt. At each point, the sheet
-    touches the object at its centre, or at another point after it has rolled from another contact.
-    For each axis of the sheet, the two rolls that end farthest from its centre are used, limited to
-    the sheet's usable size.
+    The contact points are sampled from all directions within the scene's tilt range. At each
+    contact point, the object touches the centre of the sheet, or another point of the sheet that
+    has rolled there from another contact. For each axis of the sheet, the two rolls are used that
+    end farthest from the sheet's centre, limited to the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)
@@ -260,7 +261,7 @@ def _list_contacts(
 
 
 def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
-    """Combine every contact with every push depth, and with the minimum and the maximum stretch.
+    """Combine each contact with each push depth, and with both the minimum and maximum stretch.
 
     A push moves the sheet along its normal. The arms must also follow a push at the scene's working
     speed.
@@ -309,7 +310,7 @@ def check_layout(
 
 
 def _check_reach(scene: Scene, contacts: Sequence[ContactSample], progress: Progress) -> Layout:
-    """Return the layout without remedies."""
+    """Return the result of the layout check, but search for no remedies."""
     samples = make_samples(scene, contacts)
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
     progress(f"{len(samples.poses)} poses of the sheet, left arm")
@@ -398,7 +399,7 @@ def _find_largest(scene: Scene, key: str, step: float, progress: Progress) -> fl
     """Return the largest value of one key with which the whole working range is reachable.
 
     The search is a bisection over the multiples of `step` below the value in the scene. Return None
-    if no tested value is reachable.
+    if no tested value makes all samples reachable.
     """
     low, high = 0, math.ceil(round(getattr(scene.working_range, key) / step, 6))
     number, count = 0, math.ceil(math.log2(max(high, 1)))
@@ -508,9 +509,9 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the fraction of the samples that violate a limit most.
+    """Return the fraction of the samples for which a given limit is the most violated limit.
 
-    The result also contains the one of these samples with the smallest tilt.
+    The result also contains the sample with the smallest tilt among these samples.
 
     number: index of the limit.
     binding: index (n,) of the most violated limit of each sample; -1 for reachable samples.
@@ -599,7 +600,7 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 
 def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index (n,) of the limit that each sample violates most; -1 if it is reachable."""
+    """Return the index (n,) of the limit that each sample violates most; -1 if none is violated."""
     return np.where(reach.reachable, -1, reach.binding)
 
 
@@ -628,16 +629,17 @@ class _TiltDepthGrid:
         return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
 
     def minimum(self, values: Floats) -> Floats:
-        """Return the minimum (DEPTHS, TILTS) of values (n,) in each cell; NaN for an empty cell."""
+        """Return the minimum (DEPTHS, TILTS) of values (n,) in each cell; NaN for empty cells."""
         cells = np.full((DEPTHS, TILTS), np.inf)
         finite = np.isfinite(values)
         np.minimum.at(cells, (self.rows[finite], self.columns[finite]), values[finite])
         return np.where(np.isfinite(cells), cells, np.nan)
 
     def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Return the colour (DEPTHS, TILTS, 3) of the limit violated most often in each cell.
+        """Return the colour (DEPTHS, TILTS, 3) of the limit that is violated most in each cell.
 
-        The colour is paler if fewer samples violate a limit.
+        This is the limit that most samples in the cell violate. The colour is paler if fewer
+        samples violate a limit.
 
         binding: index (n,) of the most violated limit of each sample; -1 for reachable samples.
         colors: colour of each limit, by index.

@@ -72,7 +72,7 @@ class Reachability(StrEnum):
     NO_RESPONSE = "no_response"
     """The host completed the handshake, but no status message of the host arrived."""
     OWN_KEY_INVALID = "own_key_invalid"
-    """The connection was not attempted further, because the key of this computer cannot be used."""
+    """The host is on, but this computer has no usable key with which it could connect."""
 
 
 HANDSHAKES: dict[int, Reachability] = {
@@ -85,7 +85,7 @@ HANDSHAKES: dict[int, Reachability] = {
 
 @dataclass(slots=True)
 class HostProbe:
-    """The messages that were received from one host, and the problems during their reception.
+    """The messages that were received from one host, and the problems that occurred meanwhile.
 
     refused: reasons why messages were rejected.
     failed_handshakes: texts about connections that failed after an earlier successful connection.
@@ -174,7 +174,10 @@ async def probe_port(address: str, port: int) -> Reachability:
 
 
 async def _connect(address: str, port: int) -> int:
-    """Try to connect to a TCP port. Return the error number, or 0 after success."""
+    """Try to connect to a TCP port.
+
+    Return 0 if the connection succeeds, otherwise the error number.
+    """
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
@@ -216,7 +219,7 @@ async def _listen(
     find_source: Callable[[Writer], Source],
     timeout_s: float,
 ) -> None:
-    """Read messages of a host until all expected messages have arrived or the time is over.
+    """Read messages of a host until all expected messages have arrived or `timeout_s` has passed.
 
     If no status message of the host arrives, the reachability of the probe becomes NO_RESPONSE.
 

@@ -1,7 +1,7 @@
 """Define the groups of interchangeable methods whose errors are measured against the simulator.
 
-The groups are in the layer `launch`, because only this layer may import both the methods and the
-simulator.
+The groups are defined in the package `launch`, because only this package is allowed to import both
+the methods and the simulator.
 """
 
 from __future__ import annotations

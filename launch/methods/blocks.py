@@ -1,9 +1,9 @@
 """Plan measurements of several configurations in randomised blocks, and evaluate them.
 
 A block contains all configurations in random order, so that slow changes of the computer affect all
-of them equally. One configuration, the control, runs twice in each block; the ratio of its two runs
-shows which differences are noise. Runs in a block are not independent, so confidence intervals are
-computed by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
+of them equally. One configuration, the control, runs twice in each block. The ratio of its two runs
+shows which differences are only noise. Runs in a block are not independent, so confidence intervals
+are computed by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ SEED = 20261123
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return one list of all configuration names per block, each in a different random order."""
+    """Return one list of all configuration names per block.
+
+    Each list is in a different random order.
+    """
     random = np.random.default_rng(seed)
     return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
 
 
 def bootstrap_median(values: Floats) -> Interval | None:
-    """Return the median of values (n,), one per block, with its confidence interval.
+    """Return the median of n values, one per block, with the confidence interval of the median.
 
-    A failed run has the value NaN. Returns None if there are no finite values. If only one block
-    has a value, the limits are infinite.
+    The value of a failed run is NaN. Returns None if no value is finite. If only one value is
+    finite, the limits of the interval are infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:
@@ -48,8 +51,8 @@ def bootstrap_median(values: Floats) -> Interval | None:
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
     """Return the median ratio of positive values (n,) to the control's values in the same blocks.
 
-    The ratio has a confidence interval. The median is computed from logarithms, so a ratio and its
-    inverse have the same weight.
+    The result contains the confidence interval of the median. The median is computed from
+    logarithms, so a ratio and its inverse have the same weight.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))
@@ -62,8 +65,11 @@ def compare_paired(values: Floats, control: Floats) -> Interval | None:
 def attribute_error(parts: Floats) -> Floats:
     """Return the fractions (k,) of a mean square error that k error components cause.
 
-    parts: (k, n, d), error vectors that add up to the total error. The fractions add up to one. A
-    component that compensates other components has a negative fraction.
+    The fractions add up to one. A component that compensates other components has a negative
+    fraction.
+
+    parts: error components (k, n, d), each with n vectors of d dimensions. Their sum is the total
+        error.
     """
     whole = parts.sum(axis=0)
     total = float(np.square(whole).sum())
@@ -75,8 +81,10 @@ def attribute_error(parts: Floats) -> Floats:
 def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
     """Return the names of the points that no other point dominates (the Pareto front).
 
-    points: costs of each point; smaller is better. A point dominates another if one of its costs is
-    lower and none is higher. Costs with overlapping confidence intervals are considered equal.
+    A point dominates another if one of its costs is lower and none is higher. Costs with
+    overlapping confidence intervals are considered equal.
+
+    points: costs of each point; smaller is better.
     """
     return [
         name

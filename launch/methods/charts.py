@@ -56,8 +56,10 @@ class UnknownFamilyError(FlexsheetError, KeyError):
 
 
 def find_family(name: str) -> Family:
-    """Return the method family with the given name; raise UnknownFamilyError if it does not
-    exist."""
+    """Return the method family with the given name.
+
+    Raises UnknownFamilyError if the family does not exist.
+    """
     if name not in FAMILIES:
         hint = did_you_mean(name, list(FAMILIES))
         raise UnknownFamilyError(f'unknown method family "{name}"; {hint}')
@@ -88,9 +90,10 @@ def measure_family(
 ) -> list[Point]:
     """Measure all selected trials of a method family, and report the progress.
 
-    A trial is a combination of a method and a case. Trials are requested one by one and measured
-    immediately, because the family may then release their data. select: function that returns
-    whether a trial is measured.
+    A trial is a combination of a method and a case. Each trial is requested and measured before the
+    next one is requested, so that the family can release its data.
+
+    select: function that returns whether a trial is measured.
     """
     family.prepare(scene, _make_reporter("computing the reference:", progress))
     points: list[Point] = []
@@ -104,8 +107,10 @@ def measure_family(
 
 
 def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Return a function (done, total) that regularly reports the progress and the remaining
-    time."""
+    """Return a function (done, total) that reports the progress and the remaining time.
+
+    It reports at regular intervals.
+    """
     eta, last_s = EtaEstimator(), -math.inf
 
     def report(done: int, total: int) -> None:
@@ -139,8 +144,8 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
     """Draw error against time on logarithmic axes, with a line along the Pareto front of each case.
 
-    If the method family has a `sweep_key`, also draw errors and extra metrics against this property
-    of the cases. A band shows the uncertainty of the reference.
+    If the method family has a `sweep_key`, errors and extra metrics are also drawn against this
+    property of the cases. In this diagram, a band shows the uncertainty of the reference.
     """
     from matplotlib.figure import Figure
 
@@ -166,8 +171,9 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
     """Draw error against time, with the tolerance as a dashed line.
 
-    Bars extend to the 99 % quantile of the time, and over the error's confidence interval. Errors
-    below 1e-4 of the tolerance are rounding errors; they are drawn at this value.
+    Horizontal bars extend to the 99 % quantile of the time. Vertical bars show the confidence
+    interval of the error. Errors below 1e-4 of the tolerance are rounding errors, and are drawn at
+    1e-4 of the tolerance.
     """
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
     min_error = 1e-4 * result["tolerance"]
@@ -232,8 +238,8 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
     """Draw a metric against the swept case property, with one line per method.
 
-    Markers of cases outside the method's range are hollow. The uncertainty of the reference is
-    grey.
+    If a case is outside the method's range, its marker is hollow. The uncertainty of the reference
+    is grey.
     """
     key, points = result["sweep_key"], result["points"]
 
@@ -291,7 +297,7 @@ def _has_reference(point: dict[str, Any]) -> bool:
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the cases of the points in order, without repetitions."""
+    """Return the cases of the points in order; each case occurs once."""
     cases: list[dict[str, Any]] = []
     for point in points:
         if point["case"] not in cases:
@@ -311,7 +317,7 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 def read_charts(folder: Path) -> list[dict[str, Any]]:
     """Read all chart results in a folder.
 
-    The method families are in the order of `FAMILIES`; other benchmarks follow.
+    Method families are returned in the order of `FAMILIES`, followed by other benchmarks.
     """
     order = list(FAMILIES)
     paths = sorted(
@@ -374,7 +380,8 @@ def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the largest times and errors of each method, and the number of cases in its range.
 
-    The times are medians and 99 % quantiles. Errors outside of the method's range are separate.
+    The times are medians and 99 % quantiles. Errors in cases outside the method's range are listed
+    separately.
     """
     rows = []
     front = pareto_front([Point(**point) for point in points if _has_reference(point)])

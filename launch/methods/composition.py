@@ -1,10 +1,10 @@
 """Find the cheapest combination of one method per method family that meets all tolerances.
 
-The error of each system metric is predicted from the measured errors of the stages. Independent
-random errors (spreads) add as squares. They are marker noise, tracking error at the time of use,
-and errors that no measurement of a method contains (planner, servo, calibration). Signed errors of
-force models and delays (biases) add linearly. The prediction decides which combination is run next
-in the graph. The measured errors of this run decide whether it is accepted.
+The error of each system metric is predicted from the measured errors of the processing stages.
+Independent random errors (spreads) add as squares. They are marker noise, tracking error at the
+time of use, and errors that no measurement of a method contains (planner, servo, calibration).
+Signed errors of force models and delays (biases) add linearly. The prediction decides which
+combination is run next in the graph. The measured errors of this run decide whether it is accepted.
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ chart system` on an idle computer.
 """
 
 P95_OVER_RMS = 1.614
-"""The ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian error."""
+"""The ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian vector."""
 
 
 class SystemMetric(StrEnum):
-    """The 95 % errors and latencies of the system that have a tolerance; the values are result
-    keys."""
+    """The 95 % errors and latencies of the system for which a tolerance exists.
+
+    The values of the enumeration are keys of the results.
+    """
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -60,9 +62,11 @@ DELAYS = frozenset({SystemMetric.TO_ARM, SystemMetric.TO_LIGHT})
 class StageOption:
     """A method that can be chosen for a stage.
 
-    cores: processor time per second. spreads, biases: random and signed 95 % errors or delays (ms)
-    that the method adds to system metrics. given: methods of other stages for which these values
-    were measured. outside: fraction of the scene's cases that are out of the method's stated range.
+    cores: processor time per second.
+    spreads, biases: random errors (spreads) and signed errors (biases) that the method adds to
+        system metrics. The errors are 95 % values; delays are in ms.
+    given: methods of other stages for which these values were measured.
+    outside: fraction of the scene's cases that are outside the method's stated range.
     """
 
     method: str
@@ -83,15 +87,17 @@ Figures = Mapping[SystemMetric, float]
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """The excess of measured over predicted system metrics, learned from runs of the graph.
+    """The difference by which measured system metrics exceed the predicted metrics.
 
-    This excess is added to later predictions.
+    It is learned from runs of the graph.
+
+    This difference is added to later predictions.
     """
 
     parts: Figures = field(default_factory=dict)
 
     def learn(self, combination: Combination, measured: Figures) -> Unexplained:
-        """Return the difference, updated with the measured metrics of a combination.
+        """Return this difference, updated with the measured metrics of a combination.
 
         With the updated difference, `predict` no longer underestimates the measured metrics.
         """
@@ -132,8 +138,10 @@ def _add_up(
 
 
 def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
-    """Return the error that each stage adds to a metric; stages without such an error are
-    omitted."""
+    """Return the error that each stage adds to a metric.
+
+    A stage is omitted if it adds no error to the metric.
+    """
     parts = {
         stage: option.spreads.get(metric, 0.0) + abs(option.biases.get(metric, 0.0))
         for stage, option in combination.items()
@@ -144,8 +152,8 @@ def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
 def list_combinations(stages: Mapping[str, Sequence[StageOption]]) -> list[Combination]:
     """Return all combinations of one option per stage, sorted by their cost.
 
-    A combination is omitted if one of its options was measured with another method of a stage
-    (field `given`).
+    A combination is omitted if one of its options was measured with a method (field `given`) that
+    the combination does not contain.
     """
     combinations = [
         dict(zip(stages, options, strict=True)) for options in product(*stages.values())
@@ -182,8 +190,8 @@ class GraphRun:
     """A run of one combination of methods in the graph.
 
     predicted, measured: 95 % values by metric; a metric that the run does not measure has its
-    predicted value in both. exceeded: ratio of value to tolerance of each metric that exceeds its
-    tolerance.
+        predicted value in both.
+    exceeded: ratio of value to tolerance of each metric that exceeds its tolerance.
     """
 
     methods: Mapping[str, str]
@@ -197,8 +205,8 @@ class GraphRun:
 class Composition:
     """The result of the search for a combination of methods.
 
-    chosen: accepted combination, or the combination that exceeds the tolerances least. runs: all
-    runs.
+    chosen: accepted combination, or the combination that exceeds the tolerances least.
+    runs: all runs.
     """
 
     chosen: Combination
@@ -239,8 +247,7 @@ class Composition:
         }
 
     def explain(self) -> list[str]:
-        """Return a sentence about the result, and one sentence for each tolerance that is not
-        met."""
+        """Return a sentence about the result, and one for each tolerance that is not met."""
         run = self.last
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
         if self.accepted:
@@ -284,16 +291,18 @@ def compose(
 ) -> Composition:
     """Find the cheapest combination of methods that meets all tolerances in a run of the graph.
 
-    1. Only combinations with the fewest cases out of range are considered.
-    2. The cheapest combination whose predicted metrics meet the tolerances with the margin is run.
-    3. If it exceeds a tolerance, all predictions are corrected, and the next combination is run.
-    4. This ends if no other combination is predicted to be better in the exceeded metrics.
-    5. Finally, cheaper combinations are run if the predictions were too large.
+    1. Only combinations with the fewest cases outside the methods' ranges are considered. 2. The
+    cheapest combination whose predicted metrics meet the tolerances with the margin is run. 3. If
+    it exceeds a tolerance, all predictions are corrected, and the next combination is run. 4. The
+    search ends if no other combination is predicted to be better in the exceeded metrics. 5.
+    Finally, if the predicted errors were too large, cheaper combinations are run.
 
     If no combination can meet a tolerance, one near the smallest attainable value is chosen.
 
-    run_graph: function that runs a combination and returns its metrics. margin: fraction of each
-    tolerance that predictions must leave. Raises ExperimentError if there is no combination.
+    run_graph: function that runs a combination and returns its metrics.
+    margin: fraction of each tolerance that predictions must leave.
+
+    Raises ExperimentError if there is no combination.
     """
     combinations = list_combinations(stages)
     if not combinations:
@@ -341,9 +350,9 @@ def compose(
 
 
 def _find_best(runs: Sequence[GraphRun], tolerances: Figures) -> int:
-    """Return the index of the run that exceeds the attainable limits least.
+    """Return the index of the run with the smallest excess over the attainable limits.
 
-    If several runs are equal in this, the cheapest is chosen.
+    If several runs exceed the limits equally, the cheapest is chosen.
     """
     limits = _relax(tolerances, [run.measured for run in runs])
     return min(
@@ -358,12 +367,13 @@ def _find_cheaper(
     tolerances: Figures,
     margin: float,
 ) -> Combination | None:
-    """Return the cheapest untested combination that is cheaper than the best run and may be as
-    good.
+    """Return the cheapest untested combination that costs less than the best run.
+
+    Only combinations are considered that are predicted to be as good as the best run.
 
     Returns None if there is no such combination. The errors of a method are worst-case errors, so
-    the sum of all methods overestimates the errors of the system. This is corrected by the ratio of
-    measured to predicted errors of the best run.
+    the sum of all methods overestimates the errors of the system. The predictions are therefore
+    multiplied by the ratio of measured to predicted errors of the best run.
     """
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     limits = _relax(allowed, [best.measured])
@@ -382,10 +392,11 @@ def _find_cheaper(
 
 
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
-    """Return the cheapest combination with predicted metrics within the attainable limits.
+    """Return the cheapest combination whose predicted metrics are within the attainable limits.
 
-    limits: wanted limits, before they are raised to attainable values. If no combination is
-    within all limits, return the combination with the smallest excess.
+    If no combination is within all limits, return the combination with the smallest excess.
+
+    limits: wanted limits, before they are raised to attainable values.
     """
     predicted = [predict(one, unexplained) for one in left]
     attainable = _relax(limits, predicted)
@@ -397,15 +408,17 @@ def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figu
 
 
 def _outside(combination: Combination) -> float:
-    """Return the sum, over all methods, of the fractions of cases that are out of range."""
+    """Return the sum, over all methods, of the fraction of cases outside the method's range."""
     return sum(option.outside for option in combination.values())
 
 
 def _relax(limits: Figures, found: Sequence[Figures]) -> Figures:
     """Raise the limits that are below the attainable values, and return the limits.
 
-    found: metrics of the combinations. A returned limit is at least the smallest value found,
-    multiplied by the ratio up to which two values are considered equal.
+    A returned limit is at least the smallest metric in `found`, multiplied by the ratio up to which
+    two values are considered equal.
+
+    found: metrics of the combinations.
     """
     return {
         metric: max(

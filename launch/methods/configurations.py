@@ -56,14 +56,14 @@ PAPER = Methods(
 )
 """The methods of Furukawa et al. 2007, sections III and IV.
 
-These are no filter, linear FEM, four triangles, and stiffness rendered only by the stretch of the
-sheet.
+There is no tracking filter. The soft body is linear FEM, and the sheet is drawn as four triangles.
+Stiffness is rendered only by the stretch of the sheet.
 """
 
 PAPER_PLANNER = {"prediction_horizon_s": 0.0}
 """The parameters of the planner for the methods of Furukawa et al. 2007.
 
-They do not compensate the delay (section V-C).
+These methods do not compensate the delay (section V-C).
 """
 
 FINEST = NODE_DEFAULTS.model_copy(
@@ -104,8 +104,8 @@ class Configuration:
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
         """Compute and cache the tables that the methods need.
 
-        Otherwise, nodes would replace missing tables by other methods, and these would be measured.
-        The table of a soft body takes minutes.
+        If a table were missing, a node would use another method, and this method would be measured
+        instead. The computation of the table of a soft body takes minutes.
         """
         if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)
@@ -151,7 +151,10 @@ def choose_cheapest(scene: Scene) -> Methods:
 
 
 def choose_tuned(scene: Scene) -> Methods:
-    """Return the method that the scene chooses for each family, or the default of the nodes."""
+    """Return the method that the scene chooses for each family.
+
+    If the scene chooses no method of a family, the default of the nodes is returned.
+    """
     chosen = scene.methods.model_dump(exclude_none=True)
     return Methods.model_validate(NODE_DEFAULTS.model_dump() | chosen)
 
@@ -159,7 +162,10 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""The name of the configuration with which others are compared; it runs twice in each block."""
+"""The name of the configuration with which others are compared.
+
+It runs twice in each block.
+"""
 
 CONTROL_AGAIN = "tuned, again"
 
@@ -181,9 +187,11 @@ def list_configurations(scene: Scene) -> list[Configuration]:
 
 
 def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
-    """Return the configurations with the given names and the control; return all if none is given.
+    """Return the configurations with the given names, and the control configuration.
 
-    Raises ExperimentError for an unknown name.
+    If no name is given, return all configurations.
+
+    Raises ExperimentError if a name is unknown.
     """
     known = list_configurations(scene)
     for name in names:
@@ -193,8 +201,10 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
-    """Write a copy of a launch file with another scene; relative paths in the copy become
-    absolute."""
+    """Write a copy of a launch file that names another scene.
+
+    Relative paths become absolute in the copy.
+    """
     with edit_yaml(launch_file, target) as launch:
         launch["scene"] = str(scene_file.resolve())
         launch.pop("record", None)

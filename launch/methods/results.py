@@ -26,7 +26,7 @@ def replace_non_finite(value: Any) -> Any:
 
 
 def machine_name() -> str:
-    """Return one line with processor name, number of cores and Python version."""
+    """Return one line with the processor's name, the number of cores and the Python version."""
     name = platform.processor() or platform.machine()
     if CPU_INFO.exists():
         lines = [line for line in CPU_INFO.read_text().splitlines() if "model name" in line]

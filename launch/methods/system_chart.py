@@ -1,10 +1,10 @@
 """Measure the speed and accuracy of the whole system for several configurations of its methods.
 
 Processor use and latency are measured in the running graph (`experiments/system_run.py`). A block
-contains all configurations; results are medians over blocks with their confidence intervals. Errors
-are 95 % values, computed in simulated time (`experiments/system_errors.py`). They are computed for
-the nominal apparatus (true parameters of the simulated hardware) and for random apparatuses. A
-trial is a separate process.
+contains all configurations. Results are medians over blocks, with the confidence intervals of these
+medians. Errors are 95 % values, computed in simulated time (`experiments/system_errors.py`). They
+are computed for the nominal apparatus (true parameters of the simulated hardware) and for random
+apparatuses. Each trial is a separate process.
 """
 
 from __future__ import annotations
@@ -66,8 +66,9 @@ COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
 class SceneTrials:
     """The trials of one scene.
 
-    trials: description of each trial for the sweep, by name. places: block and configuration of
-    each trial. common: settings that all trials share.
+    trials: description of each trial for the sweep, by name.
+    places: block and configuration of each trial.
+    common: settings that all trials share.
     """
 
     file: Path
@@ -106,8 +107,9 @@ def plan_trials(
 ) -> SceneTrials:
     """Return the trials of one scene: first the errors, then the blocks in random order.
 
-    blocks: number of repetitions. seconds: duration of each stroke. apparatuses: number of random
-    apparatuses.
+    blocks: number of repetitions.
+    seconds: duration of each stroke.
+    apparatuses: number of random apparatuses.
     """
     scene = load_scene(scene_file)
     return plan_configurations(
@@ -129,8 +131,10 @@ def plan_configurations(
     seconds: float,
     apparatuses: int = 0,
 ) -> SceneTrials:
-    """Return the trials of the chosen configurations; the control configuration runs twice per
-    block."""
+    """Return the trials of the chosen configurations.
+
+    The control configuration runs twice in each block.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     launch = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml").resolve()
     graph = load_graph(launch)
@@ -162,8 +166,7 @@ def plan_configurations(
 
 
 def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
-    """Return launch settings with which the finger has the same random motion in all runs of a
-    block."""
+    """Return launch settings that give the finger the same random motion in all runs of a block."""
     seed = FINGER_SEED + block
     return [f"{node.name}.seed={seed}" for node in graph.nodes_of_type("twin_finger")]
 
@@ -190,8 +193,9 @@ def run_system_chart(
 ) -> dict[str, Any]:
     """Measure the configurations for all scenes, and return the result of `chart system --json`.
 
-    blocks: number of repetitions per scene. seconds: duration of each stroke. apparatuses: number
-    of random apparatuses.
+    blocks: number of repetitions per scene.
+    seconds: duration of each stroke.
+    apparatuses: number of random apparatuses.
     """
     points: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
@@ -239,7 +243,10 @@ def run_system_chart(
 
 
 def read_value(row: Row, key: str) -> float:
-    """Return the value at a dotted key of a result row, such as "sheet_mm.p95"; NaN if missing."""
+    """Return the value at a dotted key of a result row, such as "sheet_mm.p95".
+
+    Return NaN if the value is missing.
+    """
     found: Any = row
     for part in key.split("."):
         found = None if found is None else found.get(part)
@@ -258,7 +265,7 @@ def list_tolerances(scene: Scene) -> dict[str, float]:
 def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[str, Any]]:
     """Summarize each configuration of a scene as a point of the chart.
 
-    Configurations without a successful run are omitted.
+    A configuration is omitted if all its runs failed.
     """
     nominal: Mapping[str, Any] = _good(rows, NOMINAL)
     speeds: dict[str, list[Row]] = {}
@@ -295,9 +302,11 @@ def summarize_configuration(
 ) -> dict[str, Any]:
     """Summarize one configuration as one point of the chart.
 
-    rows: processor use and latencies by configuration and block. errors, random: errors with the
-    nominal apparatus and with each random apparatus. Ratios to the control are computed from all
-    blocks in which both configurations have a row.
+    Ratios to the control configuration are computed from all blocks in which both configurations
+    have a row.
+
+    rows: processor use and latencies by configuration and block.
+    errors, random: errors with the nominal apparatus, and errors with each random apparatus.
     """
     own, control = rows[name], rows.get(CONTROL, {})
     blocks = sorted(own)
@@ -389,7 +398,7 @@ def _median_by_key(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def worst_ratio(point: Mapping[str, Any]) -> Interval:
-    """Return the largest ratio of error to tolerance of a point; latencies are ignored."""
+    """Return the largest ratio of error to tolerance of a point, where latencies are ignored."""
     ratios = [
         Interval(**one)
         for key, one in point["tolerance_ratios"].items()

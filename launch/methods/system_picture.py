@@ -32,8 +32,8 @@ def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
     """Draw one row of two diagrams per scene, and save the figure as SVG.
 
     The left diagram shows the worst error against the latency. The right diagram shows all errors
-    of each configuration. Filled points meet all tolerances; crosses exceed a tolerance. Bars are
-    95 % confidence intervals.
+    of each configuration. A filled point represents a configuration that meets all tolerances. A
+    cross represents one that exceeds a tolerance. Bars are 95 % confidence intervals.
     """
     from matplotlib.figure import Figure
 

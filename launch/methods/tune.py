@@ -2,8 +2,8 @@
 
 A method family contains interchangeable methods for one task. The methods are measured on this
 computer over the scene's working range. A method is sufficient if its stated range contains the
-working range, and its maximum error is below the scene's tolerance by a margin. If no method is
-sufficient, the best insufficient method is chosen and reported.
+working range. Its maximum error must also be smaller than the scene's tolerance minus a margin. If
+no method is sufficient, the best insufficient method is chosen and reported.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ MARGIN = 0.2
 TIE_RATIO = 1.1
 """The ratio of the times of two methods below which both are considered equally fast.
 
-Of equally fast methods, the most accurate one is chosen.
+If several methods are equally fast, the most accurate one is chosen.
 """
 
 Setting = str | dict[str, Any]
@@ -61,13 +61,13 @@ class UnknownTunableError(FlexsheetError, KeyError):
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """A method family, of which a scene can choose one method.
+    """A method family from which a scene can choose one method.
 
     families: locations `module:NAME` of the `Family` objects that form the method family, in the
-    order of measurement. Later objects take minutes to prepare, and are measured only if no earlier
-    method is sufficient. settings: value to write into the scene, by the method's name in the
-    chart. required_key: dotted key that a scene must have; otherwise no node uses the method
-    family.
+        order of measurement. Later objects take minutes to prepare, and are measured only if no
+        earlier method is sufficient.
+    settings: value to write into the scene, by the method's name in the chart.
+    required_key: dotted key that a scene must have; otherwise no node uses the method family.
     """
 
     name: str
@@ -86,8 +86,10 @@ class Tunable:
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
-    """Return the scene settings of all methods that a `Literal` type in `messages.methods`
-    names."""
+    """Return the scene settings of all methods that a `Literal` type names.
+
+    The types are defined in `messages.methods`.
+    """
     return {name: name for name in get_args(methods)}
 
 
@@ -135,21 +137,22 @@ TUNABLES = (
 )
 """The tunable method families in the order of tuning.
 
-The sheet shape precedes the image correction, whose settings depend on the sheet shape.
+The sheet shape precedes the image correction, because the settings of the correction depend on it.
 """
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""The names of the two-pass image correction in its chart, by method of the sheet shape."""
+"""The chart's names of the two-pass image correction, by the method of the sheet shape."""
 
 
 def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
     """Return the tunable method families that the scene uses, in the order of tuning.
 
-    names: names of the method families; if empty, all are returned. Raises UnknownTunableError for
-    an unknown name, and for a family that the scene does not use.
+    names: names of the method families; if empty, all are returned.
+
+    Raises UnknownTunableError if a name is unknown, or if the scene does not use the family.
     """
     known = [one.name for one in TUNABLES]
     for name in names:
@@ -171,10 +174,12 @@ def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
 class MethodEvaluation:
     """The evaluation of one method over a scene's working range.
 
-    median_s, slowest_s: median and maximum of the time per call over the cases. error: maximum
-    error within the method's stated range, found at `worst_case`; infinite if no reference is
-    known. outside: cases outside the method's stated range. wrong: cases without a reference, or
-    with an error above the tolerance minus its margin. points: measurements of all cases.
+    median_s, slowest_s: median and maximum of the time per call over the cases.
+    error: maximum error within the method's stated range, which occurs in the case `worst_case`;
+        infinite if no reference is known.
+    outside: cases outside the method's stated range.
+    wrong: cases that have no reference, or whose error exceeds the tolerance minus the margin.
+    points: measurements of all cases.
     """
 
     method: str
@@ -202,7 +207,7 @@ class Choice:
     """The chosen method of a method family, with the evaluations of all measured methods.
 
     composed: whether the method was chosen for the errors of the whole system. In this case, the
-    tolerance of the method family alone does not determine the choice.
+        tolerance of the method family alone does not determine the choice.
     """
 
     family: str
@@ -219,8 +224,10 @@ class Choice:
 
     @property
     def spare_ratio(self) -> float:
-        """Return the remaining fraction of the tolerance; it is negative if the error is too
-        large."""
+        """Return the fraction of the tolerance that remains.
+
+        It is negative if the error is too large.
+        """
         return 1.0 - self.chosen.error / self.tolerance
 
     def explain(self) -> str:
@@ -305,7 +312,8 @@ def evaluate_methods(
 ) -> list[MethodEvaluation]:
     """Evaluate the methods in `settings` over all measured cases in the scene's working range.
 
-    tolerance: maximum error. margin: fraction of the tolerance that must remain.
+    tolerance: maximum error.
+    margin: fraction of the tolerance that must remain.
     """
     allowed, evaluations = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
@@ -337,7 +345,7 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
     """Return the fastest method that meets the tolerance over the working range.
 
     If several methods are equally fast, the most accurate one is returned. If no method is
-    sufficient, the method with the fewest cases out of range is returned.
+    sufficient, the method with the fewest cases outside its range is returned.
     """
     sufficient = [one for one in evaluations if one.meets]
     if not sufficient:
@@ -348,8 +356,10 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
 
 
 def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
-    """Return a sort key for insufficient methods; methods with fewer cases out of range come
-    first."""
+    """Return a sort key for insufficient methods.
+
+    Methods with fewer cases outside their range come first.
+    """
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -362,8 +372,9 @@ def tune(
 ) -> list[Choice]:
     """Measure the methods of all given families in order, and choose one method per family.
 
-    margin: fraction of each tolerance that is reserved. Errors of method families that do not
-    support the scene's shape, mesh or sheet are raised.
+    Errors are raised if a method family does not support the scene's shape, mesh or sheet.
+
+    margin: fraction of each tolerance that is reserved.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
@@ -384,7 +395,7 @@ def tune(
 
 
 def find_choice(choices: Sequence[Choice], family: str) -> Choice | None:
-    """Return the choice for a method family; None if the family was not tuned."""
+    """Return the choice for a method family, or None if the family was not tuned."""
     return next((one for one in choices if one.family == family), None)
 
 
@@ -501,10 +512,10 @@ def _make_line(choice: Choice, indent: str) -> str:
 class _Block:
     """The block `methods` of a scene file, with the indices of its lines.
 
-    start: first line, including the generated comment above it. end: line after the block. If the
-    file has no such block, both are the end of the file. header: the line `methods:` if it can be
-    reused, otherwise empty. parts: key and lines of each method family, in order; comments have an
-    empty key.
+    start: first line, including the generated comment above it.
+    end: line after the block. If the file has no such block, both are the end of the file.
+    header: the line `methods:` if it can be reused, otherwise empty.
+    parts: key and lines of each method family, in order; comments have an empty key.
     """
 
     start: int
@@ -591,7 +602,7 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
 def check_target(source: Path, target: Path) -> None:
     """Raise BadInputError if the target cannot be written.
 
-    The check runs before a long measurement to protect its result.
+    The check runs before a long measurement, so that its result is not lost.
     """
     relocate_paths(_read(source), source, target)
     try:
@@ -624,9 +635,12 @@ def _draft_path(target: Path) -> Path:
 def write_choices(source: Path, target: Path, choices: Sequence[Choice], unmet: str = "") -> None:
     """Write the choices atomically into a scene file or into a copy of it.
 
-    source: scene file. target: file to write; if it is a symbolic link, the file that it points to
-    is written. unmet: as in `insert_choices`. Raises BadInputError if other parts of the scene
-    would change, or if the target cannot be written.
+    source: scene file.
+    target: file to write; if it is a symbolic link, the file that it points to is written.
+    unmet: as in `insert_choices`.
+
+    Raises BadInputError if other parts of the scene would change, or if the target cannot be
+    written.
     """
     text = insert_choices(
         relocate_paths(_read(source), source, target),
@@ -658,7 +672,7 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice], unmet: 
 def _load_draft(draft: Path, source: Path) -> Scene:
     """Load a temporary copy of a scene file that contains the choices.
 
-    Errors name the source file, because the user does not know the copy.
+    Error texts name the source file, because the user does not know the copy.
     """
     try:
         return load_scene(draft)

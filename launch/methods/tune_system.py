@@ -76,9 +76,9 @@ def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
 def make_stages(scene: Scene, choices: Sequence[Choice]) -> dict[str, list[StageOption]]:
     """Return the methods of each tuned method family, with the errors that they add to the system.
 
-    Tracking is measured with the noise of each marker method. Its error at the exposure adds to the
-    fingertip's error, and its error at the longest prediction horizon adds to the sheet's error.
-    The image correction was measured only with the chosen sheet shape.
+    Tracking is measured with the noise of each marker method. The tracking error at the time of
+    exposure adds to the fingertip's error. The tracking error at the longest prediction horizon
+    adds to the sheet's error. The image correction was measured only with the chosen sheet shape.
     """
     stages: dict[str, list[StageOption]] = {}
     for choice in choices:
@@ -130,7 +130,10 @@ def _make_option(
 
 
 def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
-    """Return the largest finite absolute value over the points in the method's range; 0 if none."""
+    """Return the largest finite absolute value over the points in the method's range.
+
+    Return 0 if there is no finite value.
+    """
     found = [abs(value(point)) for point in points if point.in_range]
     return max((one for one in found if math.isfinite(one)), default=0.0)
 
@@ -168,12 +171,15 @@ def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]
 
 
 def _outside(one: MethodEvaluation) -> float:
-    """Return the fraction of cases that are out of the method's range; 1 if it has no reference."""
+    """Return the fraction of cases that are outside the method's range.
+
+    Return 1 if no reference is known.
+    """
     return len(one.outside) / one.cases if math.isfinite(one.error) else 1.0
 
 
 def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> list[Choice]:
-    """Return the choices with the methods in `methods`, by family."""
+    """Return the choices, changed to the methods in `methods`, which are given by family."""
     return [
         replace(
             choice,
@@ -187,7 +193,8 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
 def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
     """Return the methods for a configuration of the scene.
 
-    Families without a choice have the method of the scene, or else the default.
+    If a family has no choice, the method of the scene is used. If the scene has none, the default
+    is used.
     """
     chosen = {choice.key: choice.chosen.setting for choice in choices}
     return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
@@ -204,9 +211,11 @@ def tune_system(
 ) -> tuple[Composition, list[Choice]]:
     """Find the cheapest combination of measured methods that meets the tolerances of the system.
 
-    Returns the search result, and the choices for the scene. runs: number of runs per combination;
-    the largest 95 % value of these runs is used. Raises ExperimentError if all runs of a
-    combination fail.
+    Returns the search result, and the choices for the scene.
+
+    runs: number of runs per combination; the largest 95 % value of these runs is used.
+
+    Raises ExperimentError if all runs of a combination fail.
     """
     scene = load_scene(scene_file)
     progress("measuring the tracking with the noise of each marker method")

@@ -1,6 +1,6 @@
 """Read the arm models of a scene file that refers to URDF files.
 
-A scene file may give the model of an arm as
+A scene file can give the model of an arm as
 
 model: {urdf: ur5e.urdf, base: base_link, tip: tool0, start_rad: [...]}
 
@@ -26,7 +26,7 @@ from flexsheet.nodes.models.rigid import rpy_from_rotation
 JOINTS = 6
 MAX_BYTES = 4 << 20
 CONTINUOUS_RANGE_RAD = 2.0 * np.pi
-"""The assumed range of a joint without limits: one revolution in both directions.
+"""The assumed range of a joint that has no limits: one revolution in both directions.
 
 This range protects the cables of the arm.
 """
@@ -75,8 +75,9 @@ def load_arm_models(document: Document) -> None:
 def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
     """Read the chain of six rotary joints between two links of a URDF file.
 
-    start_rad: joint angles of an arm that reaches towards the sheet. Raises UrdfError if the file
-    does not describe such a chain.
+    start_rad: start angles of the joints, with which the arm reaches towards the sheet.
+
+    Raises UrdfError if the file does not describe such a chain.
     """
     joints = {joint.child: joint for joint in _load_joints(path)}
     chain: list[Any] = []

@@ -1,6 +1,6 @@
 """Read, check and repair the mesh file of a scene.
 
-A scene file may give an object as
+A scene file can give an object as
 
 geometry: {shape: mesh_file, file: liver.obj, metres_per_unit: 0.01}
 
@@ -35,7 +35,7 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""The shape names that scene files may contain.
+"""The names of shapes that scene files can contain.
 
 A scene file refers to a mesh by a file name, and does not contain its arrays.
 """
@@ -47,12 +47,15 @@ MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
 An extent outside this range is probably caused by a wrong unit.
 """
 MAX_COORDINATE = 1e9
-"""The maximum coordinate in a mesh file, in the unit of the file, which prevents overflow."""
+"""The maximum coordinate in a mesh file, in the unit of the file.
+
+The limit prevents numeric overflow.
+"""
 
 MAX_CUTTING_RATIO = 0.01
-"""The maximum number of intersecting triangle pairs, relative to the number of triangles.
+"""The maximum number of intersecting triangle pairs, divided by the number of triangles.
 
-Up to this ratio, the smooth surface bridges the intersections. A mesh with more intersections is
+If the ratio is smaller, the smooth surface bridges the intersections. If it is larger, the mesh is
 not a solid.
 """
 
@@ -99,10 +102,12 @@ def make_scene(document: Document) -> Scene:
 def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> Mesh:
     """Read a closed mesh from a file, convert its unit to metres, and repair the mesh.
 
-    Repairs merge duplicate vertices, remove degenerate and duplicate triangles and unused vertices,
-    and orient the triangles outwards. `Mesh.origin` lists the repairs. smoothing_m: smoothing
-    length of the surface; None for the default. Raises MeshError for holes and other faults that
-    cannot be repaired.
+    The repairs merge duplicate vertices, remove degenerate triangles, duplicate triangles and
+    unused vertices, and orient the triangles outwards. `Mesh.origin` lists the repairs.
+
+    smoothing_m: smoothing length of the surface; None for the default.
+
+    Raises MeshError if the mesh has holes or other faults that cannot be repaired.
     """
     vertices, triangles, repairs = _repair(_load_trimesh(path), metres_per_unit)
     extent_m = float(np.ptp(vertices, axis=0).max())
@@ -114,7 +119,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     check_mesh(vertices, triangles)
     crossings = count_intersections(vertices, triangles)
     if crossings > MAX_CUTTING_RATIO * len(triangles):
-        raise MeshError(f"{crossings} pairs of triangles intersect in the mesh; repair it")
+        raise MeshError(f"{crossings} pairs of triangles intersect; repair the mesh")
     if crossings:
         repairs.append(f"{crossings} intersecting pairs of triangles bridged")
     if smoothing_m is None:
@@ -134,7 +139,10 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
 
 
 def _load_trimesh(path: Path) -> Any:
-    """Read a mesh file as a `trimesh.Trimesh` without repairs; raise MeshError if it is invalid."""
+    """Read a mesh file as a `trimesh.Trimesh`, and do not repair the mesh.
+
+    Raises MeshError if the file is invalid.
+    """
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(
             f"the mesh format {path.suffix} is not supported; convert the file to "
@@ -148,8 +156,8 @@ def _load_trimesh(path: Path) -> Any:
         ) from error
     if size > MAX_BYTES:
         raise MeshError(
-            f"the file has {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are allowed; decimate "
-            "the mesh"
+            f"the file has {size >> 20} MiB, but at most {MAX_BYTES >> 20} MiB are allowed; "
+            "decimate the mesh"
         )
     # Import only when needed, because only scenes with a mesh use trimesh.
     import trimesh
@@ -168,7 +176,8 @@ def _load_trimesh(path: Path) -> Any:
 def _check_arrays(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
     """Raise MeshError if arrays are invalid although trimesh has accepted them.
 
-    vertices: (v, 3). faces: (t, 3).
+    vertices: positions (v, 3) of v vertices.
+    faces: vertex indices (t, 3) of t triangles.
     """
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
         raise MeshError("the faces are not triangles of 3D points; triangulate the mesh")
@@ -186,15 +195,16 @@ def _repair(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
     """Repair a mesh, and convert its unit to metres.
 
-    Returns vertices (v, 3) in m, triangles (t, 3), and descriptions of the repairs. Raises
-    MeshError if no valid triangle remains, or if there are too many triangles.
+    Returns the vertices (v, 3) in m, the vertex indices of the triangles (t, 3), and descriptions
+    of the repairs. Raises MeshError if no valid triangle remains, or if there are too many
+    triangles.
     """
     repairs = []
     if not len(getattr(mesh, "faces", ())):
         raise MeshError("the mesh contains no triangles; export a triangle mesh")
     if len(mesh.faces) > 2 * MAX_TRIANGLES:
         raise MeshError(
-            f"the mesh has {len(mesh.faces)} triangles, at most {MAX_TRIANGLES} are allowed; "
+            f"the mesh has {len(mesh.faces)} triangles, but at most {MAX_TRIANGLES} are allowed; "
             "decimate the mesh"
         )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)

@@ -1,6 +1,6 @@
 """Read and check the texture image of a scene's object.
 
-In a scene file, the object may have
+In a scene file, the object can have
 
 appearance: {texture: image, image_file: marble.png}
 
@@ -22,7 +22,10 @@ APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_SIDE_PX = 2048
-"""The maximum width and height of a texture image, in pixels; the projector has fewer pixels."""
+"""The maximum width and height of a texture image, in pixels.
+
+The projected image has fewer pixels.
+"""
 
 
 class TextureError(FlexsheetError, ValueError):
@@ -75,7 +78,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if max(image.shape) > MAX_SIDE_PX:
         height, width = image.shape[:2]
         raise TextureError(
-            f"the image has {width}x{height} pixels, at most {MAX_SIDE_PX} per side are allowed; "
-            "reduce its size"
+            f"the image has {width}x{height} pixels, but at most {MAX_SIDE_PX} per side are "
+            "allowed; reduce its size"
         )
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

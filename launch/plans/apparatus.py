@@ -34,7 +34,10 @@ TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
 COMMISSION_STATE = "commission.json"
-"""The name of the file, in the folder of a calibrated scene, that names the original scene."""
+"""The name of the file that names the original scene.
+
+The file is in the folder of a calibrated scene.
+"""
 
 PROFILES = tuple(one.value for one in Profile)
 
@@ -51,7 +54,7 @@ class Draw:
 def parse_draw(text: str) -> Draw | None:
     """Parse the value of `--apparatus`; return None if the value is a file name.
 
-    Raises BadInputError if the value starts like a random sample but is invalid.
+    Raises BadInputError if the value starts with "seed:" but is not a valid random sample.
     """
     if not text.startswith("seed:"):
         return None
@@ -73,7 +76,8 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
     """Read an apparatus from a file, or sample a random apparatus from a text such as "seed:7".
 
     scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
-    sampled relative to the scene before commissioning, in the world frame of the camera.
+        sampled relative to the original scene, in the world frame of the camera. The original scene
+        is the scene before commissioning.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
@@ -98,8 +102,10 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
 
 
 def _load_base(scene_file: Path | None) -> Scene | None:
-    """Load the scene before commissioning; return None if the file does not result from
-    commissioning."""
+    """Load the scene as it was before commissioning.
+
+    Return None if the file does not result from commissioning.
+    """
     state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
     if state is None or not state.is_file():
         return None
@@ -151,7 +157,7 @@ def give_apparatus(
 ) -> None:
     """Set the apparatus as a parameter of all simulator nodes.
 
-    Problems, such as an apparatus in the launch file, are stored in `document`.
+    Problems, for example an apparatus in the launch file, are stored in `document`.
     """
     simulators = [one for one in entries if isinstance(one.parameters, SimulatorParameters)]
     for entry in simulators:
@@ -170,8 +176,7 @@ def give_apparatus(
 
 
 def refuse_apparatus_readers(entries: list[NodeEntry], document: Document) -> None:
-    """Report a problem if a node other than simulators and recorders reads the topic of the
-    apparatus.
+    """Report a problem if a node other than simulators and recorders reads the apparatus topic.
 
     Other nodes must not know the true parameters, because experiments measure their errors.
     """

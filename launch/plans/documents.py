@@ -55,7 +55,9 @@ M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
 MAX_VALUES = 5000
-"""The maximum number of values in a YAML file; the parser reads them in about one second.
+"""The maximum number of values in a YAML file.
+
+The parser needs about one second to read this number of values.
 
 The largest shipped file contains 300 values.
 """
@@ -75,7 +77,7 @@ SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarInt, int),
     (ScalarString, str),
 )
-"""The scalar types of the YAML parser, which preserve formatting, with their Python types."""
+"""The scalar types of the YAML parser, which preserve formatting, and their Python types."""
 
 MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
 """The types of pydantic errors for values that should be mappings."""
@@ -91,7 +93,9 @@ Key = tuple[str | int, ...]
 class Problem:
     """An error in an input file.
 
-    where: location, such as "file:line". key: path of the value. what: description of the error.
+    where: location, such as "file:line".
+    key: path of the value.
+    what: description of the error.
     remedy: what the user should do.
     """
 
@@ -127,7 +131,7 @@ class BadInputError(FlexsheetError, ValueError):
 
 @dataclass(slots=True)
 class Document:
-    """The values of a YAML file, with the line of each key and the origin of overridden values."""
+    """The values of a YAML file, the line of each key, and the origin of each overridden value."""
 
     path: Path
     values: dict[str, Any]
@@ -141,8 +145,8 @@ class Document:
     def where(self, key: Key) -> str:
         """Return the location of `key` for error texts.
 
-        It is "file:line", or the command-line option that overrides the value. If the key has no
-        line, the line of its nearest parent is used.
+        The location is "file:line", or the command-line option that overrides the value. If the key
+        has no line, the line of the nearest parent key is used.
         """
         for length in range(len(key), 0, -1):
             part = key[:length]
@@ -155,8 +159,8 @@ class Document:
     def folder(self, key: Key) -> Path:
         """Return the base folder of a relative path in the value of `key`.
 
-        It is the folder of the file that contains `key`. For a value that a command-line option
-        overrides, it is the current folder.
+        This is the folder of the file that contains `key`. If a command-line option overrides the
+        value, it is the current folder.
         """
         if key in self.overrides:
             return Path.cwd()
@@ -173,8 +177,8 @@ class Document:
     def extend(self, base: Document, levels: int) -> None:
         """Inherit the values of the document `base` that this document does not contain.
 
-        Mappings are merged down to the depth `levels`. At greater depth, a mapping replaces the
-        mapping of `base` completely.
+        Mappings are merged down to the depth `levels`. At greater depths, a mapping of this
+        document completely replaces the mapping of `base`.
         """
         own = self.lines
         self.lines = {**base.lines, **own}
@@ -187,7 +191,8 @@ class Document:
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
         """Return a problem that is located at `key` in this document.
 
-        what: description of the error. remedy: what the user should do.
+        what: description of the error.
+        remedy: what the user should do.
         """
         return Problem(self.where(key), key, what, remedy)
 
@@ -239,7 +244,9 @@ def parse_value(text: str) -> Any:
 
 @lru_cache(maxsize=32)
 def _parse_tree(text: str) -> Any:
-    """Parse text into a YAML tree that includes comments; raise YAMLError for all errors.
+    """Parse text into a YAML tree that includes comments.
+
+    Raises YAMLError if the text is invalid.
 
     Callers must not change the tree, because all calls with the same text return the same tree.
     """
@@ -259,7 +266,8 @@ def _check_size(text: str) -> None:
     """Raise YAMLError if the parsing of a text would be too slow.
 
     The parsing time grows at least quadratically with the nesting depth. Tokens are counted before
-    parsing, unless the punctuation shows that there are only a few.
+    parsing. They are not counted if there is so little punctuation that there can only be a few
+    tokens.
     """
     lines = text.splitlines()
     columns = max((len(line) - len(line.lstrip(" -?\t")) for line in lines), default=0)
@@ -282,7 +290,7 @@ def parse_json(text: str) -> Any:
     """Parse a JSON value of any size.
 
     A size limit is unnecessary, because JSON has no aliases that expand to more values. Raises
-    ValueError for invalid JSON, NaN, infinity and duplicate keys.
+    ValueError if the text is not valid JSON, or if it contains NaN, infinity or duplicate keys.
     """
 
     def refuse(name: str) -> None:
@@ -301,7 +309,10 @@ def parse_json(text: str) -> Any:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML file that contains one mapping; raise BadInputError if the file is invalid."""
+    """Read a YAML file that contains one mapping.
+
+    Raises BadInputError if the file is invalid.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -341,9 +352,9 @@ def read_document(path: Path) -> Document:
 
 
 def plain(tree: Any) -> Any:
-    """Convert a YAML tree to Python's built-in types, without comments and quoting.
+    """Convert a YAML tree to Python's built-in types, and omit comments and quoting.
 
-    Raises YAMLError if a key is a list or a mapping, and if aliases expand to more than MAX_VALUES
+    Raises YAMLError if a key is a list or a mapping, or if aliases expand to more than MAX_VALUES
     values.
     """
     left = MAX_VALUES
@@ -474,7 +485,8 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 def _existing_part(document: Document, key: Key) -> Key:
     """Return the longest prefix of `key` that exists in the document.
 
-    The error location of pydantic may also contain the name of a type.
+    `key` may be an error location from pydantic, which can contain names of types that are not keys
+    of the document.
     """
     values: Any = document.values
     for number, part in enumerate(key):
@@ -489,7 +501,7 @@ def _existing_part(document: Document, key: Key) -> Key:
 
 
 def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
-    """Return the new names of the renamed keys in the mapping that contains `key`, by old name."""
+    """Return the new names of renamed keys by old name, for the mapping that contains `key`."""
     if key[0] == "nodes" and key[2:3] == ("parameters",):
         node_type = document.values["nodes"][key[1]].get("type")
         # A launch file may also give the class path of a shipped node as its type.
@@ -504,10 +516,11 @@ def _shorten(value: Any) -> str:
 
 
 def _walk(model: Any, location: Key) -> tuple[Key, Any]:
-    """Convert the location of a pydantic error into a key of the file; also return the value's
-    type.
+    """Convert the location of a pydantic error into a key of the file.
 
-    In a union of models, the location also contains the name of the chosen model. This name is not
+    Also return the type of the value.
+
+    If the model is a union, the location also contains the name of the chosen member, which is not
     a key of the file.
     """
     key: list[str | int] = []
@@ -554,7 +567,9 @@ def _inner_type(annotation: Any, part: str | int) -> Any:
 
 @contextmanager
 def edit_yaml(source: Path, copy: Path) -> Iterator[Any]:
-    """Yield the tree of a YAML file; when the context ends, write the changed tree to `copy`.
+    """Yield the tree of a YAML file.
+
+    When the context ends, the changed tree is written to `copy`.
 
     Comments and layout are preserved.
     """

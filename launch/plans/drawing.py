@@ -38,8 +38,9 @@ STYLE = """
 class Arrow:
     """An arrow for the topics from one node to another, or for a connection to a device.
 
-    path: points of the SVG polyline, px. label_at: position of the label, px. wire: label of a
-    device connection; empty for topics.
+    path: points of the SVG polyline, px.
+    label_at: position of the label, px.
+    wire: label of a device connection; empty for topics.
     """
 
     writer: str
@@ -55,8 +56,8 @@ class Arrow:
 class GraphDrawing:
     """The geometry (px) of the drawing of a graph.
 
-    hosts: left, top, width and height of each host's frame. boxes, devices: centres of the boxes of
-    nodes and devices, by name.
+    hosts: left, top, width and height of each host's frame.
+    boxes, devices: centres of the boxes of nodes and devices, by name.
     """
 
     title: str
@@ -113,8 +114,8 @@ MARGIN, COLUMN, ROW, HOST_GAP = 30, 230, 75, 45
 def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
     """Return the topics that connect each pair of nodes (writer, reader).
 
-    Topics with any number of writers, such as estop and status, are omitted. Inputs of nodes that
-    read all published topics, such as a recorder, are also omitted.
+    Topics that can have any number of writers, such as estop and status, are omitted. Inputs of
+    nodes that read all published topics, such as a recorder, are also omitted.
     """
     links: dict[tuple[str, str], list[str]] = {}
     for node in plan.nodes.values():
@@ -128,7 +129,7 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign a column to each node, to the right of all nodes that write its inputs.
+    """Assign a column to each node, so that it is to the right of all nodes that write its inputs.
 
     links: pairs (writer, reader). Cycles are ignored.
     """
@@ -181,7 +182,9 @@ def lay_out(plan: ResolvedGraph) -> GraphDrawing:
 def _connect(boxes: dict[str, Position], writer: str, reader: str, topics: Sequence[str]) -> Arrow:
     """Return the arrow between two nodes.
 
-    The arrow is straight if the reader is on the right; otherwise it passes below both boxes.
+    The arrow is straight if the reader is to the right of the writer. Otherwise, it passes below
+    both boxes.
+
     boxes: centres of the nodes, px.
     """
     (x1, y1), (x2, y2) = boxes[writer], boxes[reader]
@@ -213,7 +216,7 @@ def mermaid(plan: ResolvedGraph) -> str:
 
 
 def text_lines(plan: ResolvedGraph) -> Iterator[str]:
-    """Yield text lines with the nodes of each host, their topics, and the readers of the topics."""
+    """Yield text lines with the nodes of each host, their topics, and the readers of each topic."""
     links = list_links(plan)
     for host, address in plan.hosts.items():
         yield f"{host} ({address})"

@@ -1,6 +1,6 @@
 """List the parts of the display that a run can omit.
 
-The module is separate, so that commands import it fast.
+The module is separate, so that commands can import it fast.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from flexsheet.messages.security import is_key
 
 
 def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
-    """Report a problem if the address or key of a host is invalid or not unique."""
+    """Report a problem if the address or the key of a host is invalid or not unique."""
     if MAIN not in hosts:
         document.report(
             ("hosts",), f'no host is named "{MAIN}"', "rename the host that runs the tools"

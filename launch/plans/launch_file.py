@@ -33,7 +33,7 @@ It is high, because the console must not delay other nodes.
 """
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
-"""The strftime pattern of the path of bag files that are recorded from the console.
+"""The strftime pattern for the paths of bag files that are recorded from the console.
 
 The path is relative to the working folder.
 """
@@ -41,7 +41,7 @@ The path is relative to the working folder.
 MERGED_LEVELS = 4
 """The depth to which a launch file is merged with the file that it extends.
 
-It includes the keys nodes.NAME.parameters.KEY.
+At this depth are the keys nodes.NAME.parameters.KEY.
 """
 
 SCENE_KEY_SET = frozenset({"object", "sheet", "arms", "camera", "working_range"})
@@ -59,8 +59,8 @@ class HostSpec(StrictModel):
     )
     may_reset_estop: bool | None = Field(
         default=None,
-        description="whether nodes of the host may reset an emergency stop; null: only nodes of "
-        "the main host may",
+        description="whether nodes of the host are allowed to reset an emergency stop; null: only "
+        "nodes of the main host are allowed",
     )
 
 
@@ -154,6 +154,7 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     """Read a launch file, and merge it with the files that it extends.
 
     extending: files that extend this file, directly or indirectly, to detect circular references.
+
     Raises BadInputError if a file is invalid.
     """
     if not path.exists():
@@ -200,7 +201,9 @@ def apply_scene(document: Document, scene: Path) -> None:
 def apply_setting(document: Document, setting: str) -> None:
     """Apply one value of the option --set to a launch file.
 
-    setting: NODE.PARAMETER=VALUE or scene=FILE. Raises BadInputError if the setting is invalid.
+    setting: NODE.PARAMETER=VALUE or scene=FILE.
+
+    Raises BadInputError if the setting is invalid.
     """
     origin = f"--set {setting}"
     target, equals, text = setting.partition("=")
@@ -235,8 +238,10 @@ def apply_setting(document: Document, setting: str) -> None:
 
 
 def apply_record(document: Document, bag: Path) -> None:
-    """Set the bag file of the recorder, as the option --record does; add a recorder if
-    necessary."""
+    """Set the bag file of the recorder, as the option --record does.
+
+    If there is no recorder, add one.
+    """
     origin = f"--record {bag}"
     if bag.exists():
         raise BadInputError.single(
@@ -268,7 +273,7 @@ def apply_console(document: Document) -> None:
 
 
 def _find_role(type_name: object) -> NodeRole | None:
-    """Return the role of a node type; None if its class has no role or cannot be imported."""
+    """Return the role of a node type, or None if its class has no role or cannot be imported."""
     try:
         return find_role(node_class(str(type_name)))
     except (UnknownNodeError, ImportError, AttributeError, TypeError):

@@ -1,8 +1,9 @@
 """Omit the nodes of a graph that its scene and its other nodes do not need.
 
-Without a material in the scene, no soft body is computed. Without a projector, no image is
-rendered. A node whose class sets `Node.on_demand` is omitted if no other node reads its topics. A
-recorder counts as a reader of the topics in its parameters, but not of its default topics.
+If the scene contains no material, no soft body is computed. If it contains no projector, no image
+is rendered. A node whose class sets `Node.on_demand` is omitted if no other node reads its topics.
+A recorder counts as a reader of the topics in its parameters, but not as a reader of its default
+topics.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ def omit_unneeded(
     needed: Collection[str],
     external: Collection[str] = (),
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
-    """Return the nodes that are started, and the omitted nodes with the reasons.
+    """Return the nodes that are started, and the omitted nodes with the reasons for their omission.
 
-    Ports that a node does not use with its parameters and this scene are disconnected. The scene is
-    ignored if a node of the graph publishes scenes, because a later scene may need more nodes.
+    A port is disconnected if the node does not use it with its parameters and this scene. If a node
+    of the graph publishes scenes, the scene is ignored, because a later scene can need more nodes.
 
-    needed: topics that command-line tools read. external: topics that command-line tools write.
+    needed: topics that command-line tools read.
+    external: topics that command-line tools write.
     """
     fixed = scene
     if any(topic.name == "scene" for entry in entries for _, topic in entry.topics("output")):
@@ -96,7 +98,7 @@ EXTERNAL_TOPICS = frozenset(name for name, topic in TOPICS.items() if topic.many
     "scene",
     "twin/apparatus",
 }
-"""The topics that may be written by the launcher or by command-line tools."""
+"""The topics that the launcher or command-line tools can write."""
 
 
 def _required_inputs(entry: NodeEntry) -> set[str]:
@@ -108,7 +110,7 @@ def _required_inputs(entry: NodeEntry) -> set[str]:
 def _list_read_topics(entry: NodeEntry) -> set[str]:
     """Return the topics that a node reads.
 
-    For a recorder, only the topics in its parameters are returned.
+    If the node is a recorder, only the topics in its parameters are returned.
     """
     if entry.type is None or entry.parameters is None:
         return set()

@@ -2,7 +2,7 @@
 
 `load_graph` returns a `ResolvedGraph` with all defaults and network endpoints, before any process
 starts. All errors of the file are reported together. All hosts must resolve the launch file to the
-same graph; for this purpose they compare its hash.
+same graph. They compare the hash of the graph to verify this.
 """
 
 from __future__ import annotations
@@ -81,10 +81,12 @@ def load_graph(
     """Read, check and resolve a launch file.
 
     settings: texts "node.parameter=value" with a YAML value, or "scene=FILE", which override the
-    file. record: bag file to write, which overrides the recorder's setting in the launch file.
-    console: whether to add a console and a paused recorder, unless the file contains them.
-    apparatus: true parameters of the simulated hardware, as a file or "seed:N"; None uses the
-    scene's values. needed: topics that the caller reads; their writers are started.
+        file.
+    record: bag file that the recorder writes, instead of the file in the launch file.
+    console: whether to add a console and a paused recorder if the file does not contain them.
+    apparatus: true parameters of the simulated hardware, as a file or "seed:N"; None: the scene's
+        values are used.
+    needed: topics that the caller reads; their writers are started.
     without: parts of the display that are omitted.
 
     Raises BadInputError with all errors of the file.
@@ -266,8 +268,8 @@ def _marked(parameters: NodeParameters, mark: ParameterMark) -> list[Any]:
 def _device_address(parameters: NodeParameters) -> str | None:
     """Return the address "host:port" of the device that a node controls.
 
-    Returns None unless exactly one parameter is marked as the device's host, and exactly one as its
-    port.
+    Returns None unless exactly one parameter is marked as the device's host, and exactly one
+    parameter as the device's port.
     """
     hosts = _marked(parameters, ParameterMark.DEVICE_HOST)
     ports = _marked(parameters, ParameterMark.DEVICE_PORT)
@@ -275,7 +277,7 @@ def _device_address(parameters: NodeParameters) -> str | None:
 
 
 def _device_files(parameters: NodeParameters) -> tuple[str, ...]:
-    """Return the sorted device files in the parameters of a node; stream URLs are not included."""
+    """Return the sorted device files in the parameters of a node. Stream URLs are not included."""
     files = _marked(parameters, ParameterMark.DEVICE_FILE)
     return tuple(sorted({file for file in files if not urlsplit(file).scheme}))
 

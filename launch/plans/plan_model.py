@@ -38,7 +38,7 @@ ROLES_OF_TYPES = {
     "renderer": NodeRole.RENDERER,
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
-"""The roles of nodes by node type, for plans in older bags that do not contain roles."""
+"""The roles of nodes by node type, for plans in older bags, which do not contain roles."""
 
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
@@ -51,7 +51,8 @@ These plans do not list calibrations.
 class ArmingMode(StrEnum):
     """The values of the parameter `arming` of the arm bridge.
 
-    auto: the arm moves without a command. manual: the arm moves only after a command of the user.
+    auto: the arm moves without a command.
+    manual: the arm moves only after a command of the user.
     """
 
     MANUAL = "manual"
@@ -59,7 +60,7 @@ class ArmingMode(StrEnum):
 
 
 class StrictModel(LimitedModel):
-    """The base class of immutable models that reject unknown keys."""
+    """The base class of models that are immutable and reject unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -68,8 +69,8 @@ class RestartSpec(StrictModel):
     """A restart policy that is applied when the process of a node exits.
 
     The first restart in `window_s` is immediate. The delay before the second restart is `delay_s`
-    and doubles with each further restart, up to `max_delay_s`. If the process exits after
-    `max_restarts` restarts in `window_s`, the node has failed and the run ends.
+    and doubles with each further restart, up to `max_delay_s`. If the process exits after it has
+    restarted `max_restarts` times in `window_s`, the node has failed and the run ends.
     """
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"
@@ -80,8 +81,10 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """A writer of a topic, with an ipc endpoint for its own host and a tcp endpoint for other
-    hosts."""
+    """A writer of a topic, with its endpoints.
+
+    The ipc endpoint is for readers on the same host. The tcp endpoint is for other hosts.
+    """
 
     name: str
     host: str
@@ -107,8 +110,10 @@ class Writer(StrictModel):
 
 
 class ResolvedPort(StrictModel):
-    """A port of a node, with its topic and the endpoints that it binds (output) or reads
-    (input)."""
+    """A port of a node, with its topic and its endpoints.
+
+    An output port binds the endpoints. An input port reads them.
+    """
 
     port: str
     topic: str
@@ -147,14 +152,13 @@ class ResolvedNode(StrictModel):
 
     @property
     def arm_side(self) -> str | None:
-        """Return "left" or "right" if the node publishes the state of an arm; otherwise return
-        None."""
+        """Return "left" or "right" if the node publishes the state of an arm, otherwise None."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
 
     @property
     def arming(self) -> ArmingMode | None:
-        """Return the value of the parameter `arming`; None if the node has no such parameter."""
+        """Return the value of the parameter `arming`, or None if the node has no such parameter."""
         value = self.parameters.get("arming")
         return ArmingMode(value) if value in tuple(ArmingMode) else None
 
@@ -184,7 +188,7 @@ class ResolvedProcess:
 
     @property
     def settings(self) -> ResolvedNode:
-        """Return the first node; its process settings apply to all nodes of the process."""
+        """Return the first node. Its process settings apply to all nodes of the process."""
         return self.nodes[0]
 
     @property
@@ -193,7 +197,7 @@ class ResolvedProcess:
 
 
 class OmittedNode(StrictModel):
-    """A node of the launch file that is not started, with the reason for this."""
+    """A node of the launch file that is not started, with the reason."""
 
     name: str
     type: str
@@ -202,8 +206,7 @@ class OmittedNode(StrictModel):
 
 
 class ResolvedGraph(StrictModel):
-    """A resolved launch file, with all nodes, hosts and defaults, and the endpoints of all
-    topics."""
+    """A resolved launch file, with nodes, hosts, default values and the endpoints of all topics."""
 
     launch_file: str
     launch_text: str
@@ -225,7 +228,7 @@ class ResolvedGraph(StrictModel):
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
-        """Return the writer `name` of a topic; None if this name may not write the topic."""
+        """Return the writer `name` of a topic, or None if it is not allowed to write the topic."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
@@ -233,7 +236,7 @@ class ResolvedGraph(StrictModel):
         return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
 
     def may_reset_estop(self) -> tuple[str, ...]:
-        """Return the names of the writers that may reset an emergency stop."""
+        """Return the names of the writers that are allowed to reset an emergency stop."""
         return tuple(
             writer.name
             for writer in self.writers.get("estop", ())
@@ -254,7 +257,8 @@ class ResolvedGraph(StrictModel):
     ) -> list[ResolvedProcess]:
         """Return the processes on `host`, in the order of their first nodes.
 
-        host: name of a host; None for all hosts. without: names of nodes that are not started.
+        host: name of a host; None for all hosts.
+        without: names of nodes that are not started.
         """
         members: dict[str, list[ResolvedNode]] = {}
         for node in self.nodes_on(host):

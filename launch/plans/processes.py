@@ -17,8 +17,8 @@ COMMON_KEYS = ("host", "nice", "restart", "liveness_s")
 def check_processes(entries: list[NodeEntry], document: Document) -> None:
     """Report a problem if the nodes in one process are not allowed to share it.
 
-    Their process settings must be equal. Only the simulator of its arm may share the process of an
-    arm bridge, unless the bridge sets `shares_arm_process`.
+    Their process settings must be equal. An arm bridge (node that controls an arm) is only allowed
+    to share its process with the simulator of its arm, unless it sets `shares_arm_process`.
     """
     names = {entry.name for entry in entries}
     processes: dict[str, list[NodeEntry]] = {}
@@ -51,7 +51,7 @@ def check_processes(entries: list[NodeEntry], document: Document) -> None:
 
 
 def _may_share(bridge: NodeEntry, entry: NodeEntry) -> bool:
-    """Return whether a node may share a process with the node `bridge`."""
+    """Return whether a node is allowed to share a process with the node `bridge`."""
     if bridge.type is None or find_role(bridge.type) is not NodeRole.ARM_BRIDGE:
         return True
     if bridge.spec.shares_arm_process or bridge.parameters is None or entry.parameters is None:

@@ -1,5 +1,7 @@
-"""List renamed keys and values of launch files and scenes, so that error texts name the new
-ones."""
+"""List the renamed keys and values of launch files and scenes.
+
+Error texts use these lists to state the new names.
+"""
 
 from __future__ import annotations
 

@@ -43,8 +43,9 @@ Other nodes have their parameters below the key `parameters`.
 class NodeEntry:
     """A node of a launch file during its resolution.
 
-    type, parameters: class and parameters of the node; None until they are resolved. ports:
-    connected ports with their topics. unconnected: unconnected ports with the topics of their type.
+    type, parameters: class and parameters of the node, which are None until they are resolved.
+    ports: connected ports with their topics.
+    unconnected: unconnected ports with the topics of their type.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -56,17 +57,18 @@ class NodeEntry:
         self.further_inputs: list[Topic] = []
 
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
-        """Return (port name, topic) of all connected ports of a direction ("input" or "output")."""
+        """Return (port name, topic) of all connected ports in a direction ("input" or "output")."""
         found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
         if direction == "input":
             found += [(further_port(topic.name), topic) for topic in self.further_inputs]
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs without a writer.
+        """Disconnect optional inputs whose topics have no writer.
 
-        Inputs that the launch file names explicitly stay connected. written: names of the topics
-        that have a writer.
+        Inputs that the launch file names explicitly stay connected.
+
+        written: names of the topics that have a writer.
         """
         if self.type is None:
             return
@@ -77,7 +79,7 @@ class NodeEntry:
         )
 
     def disconnect(self, ports: Iterable[str]) -> None:
-        """Disconnect the named ports, except for ports with a topic in the launch file."""
+        """Disconnect the named ports, except for ports to which the launch file assigns a topic."""
         names = set(ports) - self.spec.topics.keys()
         for port, topic in [*self.ports]:
             if port.name in names:
@@ -85,7 +87,7 @@ class NodeEntry:
                 self.unconnected.append((port, topic))
 
     def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
-        """Return the unconnected ports of a direction ("input" or "output")."""
+        """Return the unconnected ports in a direction ("input" or "output")."""
         return tuple(
             ResolvedPort(port=port.name, topic=topic.name, endpoints=())
             for port, topic in self.unconnected
@@ -276,12 +278,11 @@ CALIBRATION_CHECKS: dict[
     ),
     ParameterMark.MARKER_CALIBRATION: (load_marker_calibration, refuse_other_marker),
 }
-"""The functions that load a calibration file, and that refuse a file for another scene."""
+"""The functions that load a calibration file and that reject a file for another scene."""
 
 
 def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: Document) -> None:
-    """Report a problem if a calibration file in a node's parameters is invalid or unfit for the
-    scene."""
+    """Report a problem if a node's calibration file is invalid or does not fit the scene."""
     for entry, (mark, (load, refuse)) in product(entries, CALIBRATION_CHECKS.items()):
         if entry.parameters is None:
             continue
@@ -302,7 +303,7 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
     """Return all parameters of a node as JSON values, including defaults.
 
     resolve_paths: whether to make paths absolute; paths in the launch file are relative to its
-    folder.
+        folder.
     """
     assert entry.parameters is not None  # otherwise the load has failed
     values = entry.parameters.model_dump(mode="json")
@@ -316,9 +317,11 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 
 
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
-    """Return the JSON form of a parameter value with absolute instead of relative paths.
+    """Return the JSON form of a parameter value, with relative paths replaced by absolute paths.
 
-    value: parameter value. dumped: its JSON form. base: base folder of relative paths.
+    value: parameter value.
+    dumped: JSON form of the value.
+    base: base folder of relative paths.
     """
     if isinstance(value, Path):
         return _absolute(value, base)

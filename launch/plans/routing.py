@@ -1,5 +1,4 @@
-"""Determine the writers of each topic, connect the inputs of nodes, and assign network
-endpoints."""
+"""Determine the writers of topics, connect the inputs of nodes, and assign network endpoints."""
 
 from __future__ import annotations
 
@@ -15,7 +14,7 @@ from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
 WRITABLE_ON_ALL_HOSTS = ("estop",)
-"""The topics that command-line tools may write on every host, such as the e-stop of the arms."""
+"""The topics that command-line tools are allowed to write on every host, such as `estop`."""
 
 LAUNCHER_TOPICS = ("host", "estop")
 """The topics that the launchers on all hosts publish."""
@@ -23,7 +22,7 @@ LAUNCHER_TOPICS = ("host", "estop")
 FIRST_PORT, PORT_COUNT = 20_000, 10_000
 """The first TCP port of topics, and the number of ports.
 
-These ports are below those that Linux uses for outgoing connections (from 32768).
+These ports are below the ports that Linux uses for outgoing connections (from 32768).
 """
 
 
@@ -37,8 +36,9 @@ def list_writers(
 ) -> dict[str, list[tuple[str, str]]]:
     """Return the (writer, host) pairs of each topic, in the order of the launch file.
 
-    has_scene, has_apparatus: whether the launcher publishes a scene and an apparatus. Topics with
-    more writers than allowed are reported to `document`.
+    A topic that has more writers than allowed is reported to `document`.
+
+    has_scene, has_apparatus: whether the launcher publishes a scene and an apparatus.
     """
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
@@ -104,10 +104,12 @@ def resolve_further_inputs(
 def check_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Report a problem if a required input has no writer; disconnect optional inputs without
-    writers.
+    """Report a problem if a required input has no writer.
 
-    The check is omitted if a node has an unknown type, because this node may be the missing writer.
+    An optional input is disconnected if it has no writer.
+
+    The check is omitted if a node has an unknown type, because this node could be the missing
+    writer.
     """
     if any(entry.type is None for entry in entries):
         return
@@ -133,9 +135,11 @@ def make_endpoints(
 ) -> dict[str, tuple[Writer, ...]]:
     """Return the writers of each topic with their network endpoints.
 
-    writers: (writer, host) pairs by topic. addresses: IP addresses by host. The endpoints are ipc
-    for connections on one host, and tcp for connections between hosts. If there is only one host,
-    topics have no tcp endpoint.
+    The endpoints are ipc for connections on one host, and tcp for connections between hosts. If
+    there is only one host, topics have no tcp endpoint.
+
+    writers: (writer, host) pairs by topic.
+    addresses: IP addresses by host.
     """
     far = sorted(
         (host, writer, topic)
@@ -165,10 +169,10 @@ def _make_tcp_endpoint(address: str, port: int | None) -> str | None:
 
 
 def _assign_ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
-    """Return a TCP port for each (host, writer, topic), computed from the hash of these names.
+    """Return a TCP port for each (host, writer, topic), computed from a hash of these names.
 
     If two hashes collide, the later name gets the next free port. A new topic therefore changes
-    only colliding ports. Ports are unique over all hosts, because several hosts of a graph may be
+    only ports that collide. The ports of all hosts differ, because several hosts of a graph can be
     the same computer.
     """
     taken: dict[int, tuple[str, str, str]] = {}

@@ -17,8 +17,8 @@ def list_shipped(folder: Path) -> list[str]:
 def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
     """Return the path of a YAML file that is given as a path or as the name of a shipped file.
 
-    shipped: folder of shipped files, LAUNCH_FILES or SCENES. folder: base folder of a relative
-    path. If there is no such file, the given path is returned.
+    shipped: folder of shipped files, LAUNCH_FILES or SCENES.
+    folder: base folder of a relative path. If no such file exists, the given path is returned.
     """
     path, named = folder / given, shipped / f"{given}.yaml"
     return named if not (path.exists() or path.suffix) and named.is_file() else path

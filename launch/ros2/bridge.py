@@ -1,7 +1,8 @@
 """Bridge a running graph to ROS 2: publish its topics over DDS, and accept external inputs.
 
-The bridge has the permissions of a command-line tool: to read all topics of the graph, and to write
-those that tools may write. External messages have the writer name of tools.
+The bridge has the permissions of a command-line tool. It is allowed to read all topics of the
+graph, and to write the topics that tools are allowed to write. External messages have the writer
+name of command-line tools.
 """
 
 from __future__ import annotations
@@ -32,11 +33,13 @@ from flexsheet.messages.topics import TOPICS, find_topic
 
 
 class Ros2Bridge:
-    """A bridge between one running graph and one participant of the middleware DDS.
+    """A bridge between one running graph and one participant of DDS, the middleware of ROS 2.
 
-    topics: flexsheet topics to publish. accept: topics to accept from ROS nodes (keys of `INPUTS`).
-    noise_m: standard deviation of external fingertip positions. published, accepted: numbers of
-    messages by topic. on_problem: function that is called with the text of an error.
+    topics: flexsheet topics to publish.
+    accept: topics to accept from ROS nodes (keys of `INPUTS`).
+    noise_m: standard deviation of external fingertip positions.
+    published, accepted: numbers of messages by topic.
+    on_problem: function that is called with the text of an error.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class Ros2Bridge:
         ]
 
     def start(self) -> None:
-        """Connect to the graph and to ROS; this requires a running event loop."""
+        """Connect to the graph and to ROS. An event loop must be running."""
         for subscriber in self._subscribers:
             subscriber.start()
         for name in self._accept:

@@ -23,7 +23,7 @@ from flexsheet.launch.ros2.mapping import RosTopic, load_ros_types
 LOOPBACK = "lo"
 MAX_DOMAIN = 232
 MAX_PARTICIPANTS = 120
-"""The maximum number of DDS participants that find each other without multicast."""
+"""The maximum number of DDS participants that find each other if multicast is disabled."""
 
 WAIT_S = 0.2
 BLOCKING_S = 0.1
@@ -45,8 +45,8 @@ def mangle_type(name: str) -> str:
 def make_configuration(interface: str) -> str:
     """Return the XML configuration of Cyclone DDS for one network interface.
 
-    The loopback interface is configured without multicast. Raises Ros2Error if this computer has no
-    such interface.
+    For the loopback interface, multicast is disabled. Raises Ros2Error if this computer has no such
+    interface.
     """
     if interface not in psutil.net_if_addrs():
         names = ", ".join(sorted(psutil.net_if_addrs()))
@@ -76,7 +76,10 @@ class Sample:
 
 @cache
 def make_dds_type(ros_type: str) -> Any:
-    """Make a Cyclone DDS type for a ROS type, whose samples contain CDR bytes in `cdr`."""
+    """Make a Cyclone DDS type for a ROS type.
+
+    The samples of the type contain CDR bytes in the field `cdr`.
+    """
     described = _describe(ros_type)
 
     def serialize(self: Any, **_: Any) -> bytes:
@@ -117,8 +120,10 @@ def _describe(ros_type: str) -> Any:
 class RosParticipant:
     """A participant of a DDS domain that publishes and subscribes to ROS topics.
 
-    domain: number of the domain, equal to the ROS_DOMAIN_ID of the other participants. interface:
-    name of the network interface. Raises Ros2Error if the participant cannot be created.
+    domain: number of the domain, equal to the ROS_DOMAIN_ID of the other participants.
+    interface: name of the network interface.
+
+    Raises Ros2Error if the participant cannot be created.
     """
 
     def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
@@ -151,11 +156,11 @@ class RosParticipant:
             )
 
     def has_readers(self, topic: RosTopic) -> bool:
-        """Return whether a topic has readers or is latched, so that it must be published."""
+        """Return whether a topic must be published because it has readers or is latched."""
         return topic.latched or bool(self._writers[topic.name].get_matched_subscriptions())
 
     def write(self, topic: RosTopic, cdr: bytes) -> None:
-        """Publish a message on an advertised topic; raise Ros2Error if this fails.
+        """Publish a message on an advertised topic. Raises Ros2Error if this fails.
 
         cdr: serialized message.
         """
@@ -175,7 +180,7 @@ class RosParticipant:
         """Subscribe to a topic.
 
         on_message: function that is called in the running event loop with the CDR bytes of each
-        message.
+            message.
         """
         from cyclonedds.core import InstanceState as State
         from cyclonedds.core import ReadCondition, SampleState, ViewState
@@ -217,10 +222,10 @@ class RosParticipant:
 
 
 def _make_qos(topic: RosTopic) -> Any:
-    """Return the DDS quality of service: reliable, and transient local for a latched topic.
+    """Return the DDS quality of service: reliable, and transient local if the topic is latched.
 
-    A reliable writer is compatible with reliable and with best-effort readers. Without the hash of
-    the type, ROS 2 Iron and later releases would print a warning.
+    A reliable writer is compatible with reliable and with best-effort readers. If the hash of the
+    type were missing, ROS 2 Iron and later releases would print a warning.
     """
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration

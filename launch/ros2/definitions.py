@@ -1,4 +1,4 @@
-"""Generate ROS 2 message types, in the package `flexsheet_msgs`, from those of flexsheet.
+"""Generate the ROS 2 message types of the package `flexsheet_msgs` from flexsheet's message types.
 
 A message type or a group of fields becomes a ROS type of the same name. Fields become:
 
@@ -32,7 +32,7 @@ from flexsheet.messages.field_types import get_annotation, is_image, split_annot
 
 PACKAGE = "flexsheet_msgs"
 HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
-"""The first fields of all generated ROS message types; `writer` is the publishing node."""
+"""The first fields of all generated ROS message types. `writer` is the publishing node."""
 
 ELEMENTS = {"<f8": "float64", "<f4": "float32", "<i4": "int32", "<i8": "int64", "|u1": "uint8"}
 """The ROS element types of array fields, by NumPy element type."""
@@ -50,7 +50,7 @@ class Ros2Error(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class OwnField:
-    """A field of a generated ROS type, with a function that converts its values."""
+    """A field of a generated ROS type, and a function that converts the values of this field."""
 
     name: str
     ros_type: str
@@ -60,7 +60,7 @@ class OwnField:
 def split_time(at_ns: int) -> dict[str, int]:
     """Split a time (ns since 1970) into the fields of a ROS time.
 
-    Raises Ros2Error for a time before 1970 or after 2038, which ROS 2 cannot represent.
+    Raises Ros2Error if the time is before 1970 or after 2038, because ROS 2 cannot represent it.
     """
     seconds, nanoseconds = divmod(at_ns, 1_000_000_000)
     if not 0 <= seconds < 1 << 31:
@@ -78,7 +78,7 @@ def ros_name(kind: type[BaseModel]) -> str:
 
 @cache
 def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
-    """Return the ROS fields of a message type or group in order of declaration, without images."""
+    """Return the ROS fields of a message type or group in order of declaration; omit images."""
     stamps = find_stamp_fields(kind) if issubclass(kind, Message) else ()
     fields = []
     for name, info in kind.model_fields.items():
@@ -162,8 +162,10 @@ def _describe_sequence(
 ) -> tuple[str, Callable[[Any, Make], Any]]:
     """Return the ROS type of a sequence, and a function that converts its values.
 
-    item: annotation of an element. suffix: array part of the ROS type, such as "[]". split:
-    function that returns the elements of a value. None becomes an empty sequence.
+    item: annotation of an element.
+    suffix: array part of the ROS type, such as "[]".
+    split: function that returns the elements of a value. The value None is converted to an empty
+        sequence.
     """
     item_type, convert = _describe(item)
     if "[" in item_type:  # ROS does not support sequences of sequences.

@@ -1,7 +1,8 @@
 """Check messages of external ROS nodes, and convert them to messages of flexsheet.
 
-A message is rejected if its frame, numbers or timestamp are not plausible. External fingertips are
-filtered by the same tracker as those from the camera. External messages cannot command the arms.
+A message is rejected if its frame, numbers or timestamp are not plausible. External fingertip
+positions are filtered by the same tracker as positions from the camera. External messages cannot
+command the arms.
 """
 
 from __future__ import annotations
@@ -47,15 +48,15 @@ INPUTS = {
                           RosTopic("/external/fingertip", "geometry_msgs/msg/PointStamped", False),
                           "point of the finger's pad that touches the sheet"),
 }  # fmt: skip
-"""The possible external inputs, by the flexsheet topic on which they are published."""
+"""The possible external inputs, by the flexsheet topic on which each is published."""
 
 
 @dataclass(slots=True)
 class ExternalInputs:
     """A converter of external messages that rejects implausible messages.
 
-    noise_m: standard deviation of external fingertip positions. rejected: numbers of rejected
-    messages by reason.
+    noise_m: standard deviation of external fingertip positions.
+    rejected: numbers of rejected messages by reason.
     """
 
     noise_m: float
@@ -73,9 +74,12 @@ class ExternalInputs:
     ) -> tuple[Message, int] | None:
         """Return a converted ROS message and its source timestamp (ns) on the local clock.
 
-        decode: function that returns the ROS message, or raises an exception for malformed bytes.
-        now_ns: current time of the local clock. unix_ns: current time since 1970, ns. Returns None
-        if the message is rejected.
+        decode: function that returns the ROS message, or raises an exception if the bytes are
+            malformed.
+        now_ns: current time of the local clock.
+        unix_ns: current time since 1970, ns.
+
+        Returns None if the message is rejected.
         """
         try:
             if self.scene is None:

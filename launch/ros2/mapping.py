@@ -117,7 +117,7 @@ class RosTypes:
         )
 
     def duration(self) -> Any:
-        """Make a duration of zero."""
+        """Make a ROS duration of zero."""
         return self.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
 
 
@@ -131,8 +131,10 @@ def load_ros_types() -> RosTypes:
 class Source:
     """The data that the conversion of a message needs in addition to the message.
 
-    topic: topic of the message. at_ns: source timestamp of the message, ns since 1970.
-    scene, skin: latest messages of the same graph; None before the first message.
+    topic: topic of the message.
+    at_ns: source timestamp of the message, ns since 1970.
+    scene, skin: latest messages with the scene and the surface of the soft body; None before the
+        first message.
     flanges: latest flange poses (4, 4) by side.
     """
 
@@ -153,9 +155,11 @@ class Source:
 class View:
     """A ROS topic with a standard type that represents some fields of a message.
 
-    message: type of the message. fields: names of the fields. name: name of the ROS topic without
-    the first slash, in which {topic} represents the flexsheet topic. make: function that converts a
-    message, or returns None if there is nothing to publish.
+    message: type of the message.
+    fields: names of the fields.
+    name: name of the ROS topic, except for the first slash. In the name, {topic} represents the
+        flexsheet topic.
+    make: function that converts a message, or returns None if there is nothing to publish.
     """
 
     message: type[Message]
@@ -170,7 +174,8 @@ class View:
 class RosTopic:
     """A ROS 2 topic.
 
-    name: begins with a slash. latched: whether later readers receive the last message.
+    name: name of the topic, which begins with a slash.
+    latched: whether readers that connect later receive the last message.
     """
 
     name: str
@@ -290,7 +295,7 @@ FORCE_DIRECTIONS = {
     "left_edge": (1.0, 0.0, 0.0),
     "right_edge": (-1.0, 0.0, 0.0),
 }
-"""The direction (3,) of a positive measured force in the sheet frame, by axis of the sensor."""
+"""The direction (3,), in the sheet's frame, of a positive measured force, by sensor axis."""
 
 
 def _measured_force(force: Force, source: Source) -> Any | None:
@@ -357,7 +362,7 @@ def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
 
 
 def _eye_pose(eye: Eye, source: Source) -> Any | None:
-    """Return the pose of the midpoint of the eyes; None if the eyes are not valid.
+    """Return the pose of the midpoint of the eyes, or None if the eye positions are not valid.
 
     The x axis of the pose points from the left to the right eye.
     """
@@ -400,7 +405,10 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
 def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
     """Return the corners (4, 3), in m, of a flat sheet between both clamped edges.
 
-    The order is lower left, upper left, lower right, upper right. flanges: poses (4, 4) by side.
+    The order is lower left, upper left, lower right, upper right.
+
+    flanges: poses (4, 4) by side.
+
     Returns None if the scene or an arm is unknown.
     """
     if scene is None or len(flanges) < 2:
@@ -551,8 +559,8 @@ class Converter:
     ) -> Iterator[tuple[RosTopic, Any]]:
         """Convert a message, and yield pairs of a ROS topic and a ROS message.
 
-        shift_ns: difference between the time since 1970 and the clock of the header. wanted:
-        function that returns whether messages of a ROS topic are needed.
+        shift_ns: difference between the time since 1970 and the clock of the header.
+        wanted: function that returns whether messages of a ROS topic are needed.
         """
         match message:
             case Scene():

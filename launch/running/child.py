@@ -1,5 +1,4 @@
-"""Set up the process of a node, so that it ends with its launcher and has the configured
-niceness."""
+"""Set up the process of a node: it ends with its launcher and has the configured niceness."""
 
 from __future__ import annotations
 
@@ -22,15 +21,17 @@ exits.
 NICE_VARIABLE = "FLEXSHEET_NICE"
 
 AUTOGROUP = Path("/proc/self/autogroup")
-"""The file with the niceness of a session; Linux distributes processor time among sessions.
+"""The file with the niceness of the session of this process.
 
-Each node has its own session, so the niceness of its process alone has little effect.
+Linux distributes processor time among sessions, and each node has its own session. The niceness of
+a node's process alone therefore has little effect.
 """
 
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
 """The number of attempts to write AUTOGROUP, and the time (s) between two attempts.
 
-Without privileges, the kernel accepts only one write per 0.1 s from all processes together.
+If the processes have no privileges, the kernel accepts only one write per 0.1 s from all of them
+together.
 """
 
 GRACE_S = 3.0
@@ -40,7 +41,7 @@ _PR_SET_PDEATHSIG = 1
 def exit_with_parent() -> None:
     """End this process when its launcher exits.
 
-    The kernel sends SIGTERM when the launcher exits, even if the event loop of the process hangs.
+    When the launcher exits, the kernel sends SIGTERM, even if the event loop of the process hangs.
     If the process has not ended after `GRACE_S`, a thread that reads the lifeline kills the process
     and its children.
     """

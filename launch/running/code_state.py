@@ -12,7 +12,7 @@ SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "pyproject.toml")
 """The paths in the repository that contain all code of flexsheet."""
 
 SOURCE_SUFFIXES = {".py", ".glsl", ".css", ".js"}
-"""The suffixes of untracked files that count as changes of the code.
+"""The suffixes of files that count as changes of the code although git does not track them.
 
 Other files, such as new scenes and meshes, affect a run only if a launch file names them.
 """
@@ -23,8 +23,11 @@ UNTRACKED = "??"
 def read_git_state(directory: Path) -> str:
     """Return a JSON text with the git commit of the code, and whether files have changed.
 
-    directory: root of the repository. The keys are `commit` and `changed`. Outside of a git
-    repository, `commit` is the value of COMMIT_VARIABLE or null, and `changed` is null.
+    The keys of the JSON object are `commit` and `changed`. Outside a git repository, `commit` is
+    the value of the environment variable that COMMIT_VARIABLE names, or null. Outside a git
+    repository, `changed` is null.
+
+    directory: root of the repository.
     """
     listed = _git(
         directory, "status", "--porcelain", "-z", "--untracked-files=all", "--", *SOURCE_PATHS
@@ -49,7 +52,7 @@ def _has_changed_sources(listed: str) -> bool:
 
 
 def _git(directory: Path, *arguments: str) -> str | None:
-    """Run git in a directory and return its output; None if git fails or is not installed."""
+    """Run git in a directory and return its output, or None if git fails or is not installed."""
     try:
         result = subprocess.run(
             # Without this option git refuses a clone that belongs to another user.

@@ -1,9 +1,9 @@
 """Measure how long nodes wait for a processor core, and which programs use the cores.
 
-For each thread, Linux counts the time in which it was ready to run but did not get a core
+For each thread, Linux counts the time in which the thread was ready to run but did not get a core
 (`/proc/PID/schedstat`). The main thread of a node runs its event loop, so this wait delays the
 whole node. System-wide counters (load, /proc/pressure) do not show whether nodes are delayed. They
-include programs of high niceness, which are expected to wait.
+also count programs of high niceness, which are expected to wait.
 """
 
 from __future__ import annotations
@@ -18,12 +18,14 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""The maximum fraction of time that a node waits for a core on a computer without overload."""
+"""The maximum fraction of time that a node waits for a core if the computer is not overloaded."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
-"""The minimum niceness of nodes whose waiting time is ignored, because they are expected to
-wait."""
+"""The minimum niceness of nodes whose waiting time is ignored.
+
+These nodes are expected to wait.
+"""
 
 MAX_PROGRAMS = 3
 MIN_CORES = 0.1
@@ -42,8 +44,10 @@ class Waits:
 class CpuWatch:
     """A monitor of waiting times and processor times over the last WINDOW_S.
 
-    Call `update` once a second. proc: folder of the kernel's counters. now_s: function that returns
-    the time (s) of the monotonic clock.
+    Call `update` once a second.
+
+    proc: folder of the kernel's counters.
+    now_s: function that returns the time (s) of the monotonic clock.
     """
 
     def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -63,10 +67,11 @@ class CpuWatch:
         The waiting time is measured over the last WINDOW_S. Returns None if no waiting time is
         known.
 
-        watched: process ids of the measured nodes by node name. named:
-        process ids by node name, of the nodes that are reported by name; None: `watched`.
+        watched: process ids of the measured nodes by node name.
+        named: process ids, by node name, of the nodes that are reported by name; None: the nodes in
+            `watched`.
         measure_programs: whether to list the running programs even if the computer is not
-        overloaded.
+            overloaded.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -93,8 +98,7 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return the total waiting time (s) of the main thread of a process; None if it is
-        unknown."""
+        """Return the total waiting time (s) of the main thread of a process, or None if unknown."""
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:
@@ -104,8 +108,9 @@ class CpuWatch:
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
         """Return the programs that have used the most processor time since the last call.
 
-        Return no programs if the last call was more than WINDOW_S ago. named: process ids by node
-        name.
+        Return no programs if the last call was more than WINDOW_S ago.
+
+        named: process ids by node name.
         """
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}

@@ -1,8 +1,8 @@
-"""Store an engaged emergency stop (e-stop) in a file, so that it survives a launcher's restart.
+"""Store an engaged emergency stop (e-stop) in a file, so that it survives a restart of a launcher.
 
 Only a reset of the e-stop removes the file. A file that cannot be read is treated as an e-stop. The
-file name contains a hash of the arms' addresses, so that only graphs with the same arms share the
-file.
+file name contains a hash of the arms' addresses. Graphs therefore share the file only if they use
+the same arms.
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ class EStopFile:
         self.path = directory() / f"estop-{host}-{digest}.json"
 
     def read(self) -> EStop | None:
-        """Return the stored e-stop, or None; an unreadable file counts as an e-stop."""
+        """Return the stored e-stop, or None if there is none.
+
+        If the file cannot be read, return an e-stop.
+        """
         try:
             reason = json.loads(self.path.read_text())["reason"]
         except FileNotFoundError:
@@ -48,7 +51,7 @@ class EStopFile:
         return EStop(engaged=True, reason=str(reason))
 
     def write(self, estop: EStop) -> None:
-        """Store the e-stop durably against a power failure; raise OSError if this fails."""
+        """Store the e-stop, so that it survives a power failure. Raises OSError if this fails."""
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")
         with part.open("w") as file:
@@ -59,7 +62,7 @@ class EStopFile:
         self._sync_folder()
 
     def remove(self) -> None:
-        """Remove the file after a reset of the e-stop; raise OSError if this fails."""
+        """Remove the file after a reset of the e-stop. Raises OSError if this fails."""
         self.path.unlink(missing_ok=True)
         if self.path.parent.is_dir():
             self._sync_folder()

@@ -4,10 +4,11 @@ The imports of a node take longer than the rest of its start. The fork server is
 single thread, which imports the modules of a graph once and opens no sockets of the graph.
 
 The fork server forks twice. The intermediate process ends immediately, so the kernel makes the
-launcher the parent of the node's process (the launcher is a subreaper, prctl(2)). Therefore
-signals, exit codes and priorities work as for a process that the launcher has started itself.
+launcher the parent of the node's process (the launcher is a subreaper, prctl(2)). Signals, exit
+codes and priorities of this process therefore work as if the launcher had started it itself.
 
-If the fork server ends, does not answer, or has started a thread, nodes are started without it.
+If the fork server ends, does not answer, or has started a thread, the launcher starts nodes
+directly.
 """
 
 from __future__ import annotations
@@ -35,7 +36,10 @@ REQUEST_BYTES = 65_536
 PID_BYTES = 8
 READY = b"ready"
 ANSWER_S = 1.0
-"""The time (s) in which the fork server must answer a request; it usually takes milliseconds."""
+"""The time (s) in which the fork server must answer a request.
+
+An answer usually takes some milliseconds.
+"""
 
 READY_S = 20.0
 """The time (s) in which the fork server must have imported the modules."""
@@ -44,7 +48,7 @@ _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _ARGUMENTS_START, _ARGUMENTS_END = 45, 46
 """The indices of the fields with the address range of the arguments in /proc/PID/stat.
 
-The indices count from the field after the program's name, see proc(5).
+The indices count from the field after the program's name. See proc(5).
 """
 
 
@@ -59,8 +63,10 @@ class ForkedProcess:
         self.returncode: int | None = None
 
     def wait(self) -> int:
-        """Wait for the end of the process; return its exit code, or minus the signal that ended
-        it."""
+        """Wait for the end of the process, and return its exit code.
+
+        If a signal ended the process, return minus the number of the signal.
+        """
         if self.returncode is None:
             _, status = os.waitpid(self.pid, 0)
             self.returncode = os.waitstatus_to_exitcode(status)
@@ -70,9 +76,11 @@ class ForkedProcess:
 class ForkServer:
     """The launcher's connection to a fork server. The constructor starts the server.
 
-    node_types: types of the nodes. Modules of types outside this package are not imported, since
-    they may start threads. config_files: files of all processes that may be started. lifeline: file
-    descriptor that the nodes inherit. log: file for the server's own output.
+    node_types: types of the nodes. If a type is defined outside this package, its module is not
+        imported, because the module could start threads.
+    config_files: files of all processes that may be started.
+    lifeline: file descriptor that the nodes inherit.
+    log: file for the server's own output.
     """
 
     def __init__(
@@ -110,7 +118,7 @@ class ForkServer:
         self._ready: asyncio.Task[bool] = asyncio.create_task(self._wait_ready())
 
     async def is_ready(self) -> bool:
-        """Wait until the modules are imported; return False if the fork server cannot be used."""
+        """Wait until the modules are imported. Return False if the fork server cannot be used."""
         # Several processes wait at once; cancelling one of them must not cancel the task.
         return await asyncio.shield(self._ready) and self._process.poll() is None
 
@@ -130,11 +138,14 @@ class ForkServer:
     def fork(
         self, config_file: Path, environment: Mapping[str, str], output: int, ready: int
     ) -> ForkedProcess | None:
-        """Start a process with nodes; return None if this is not possible, and close the fork
-        server.
+        """Start a process with nodes, and return it.
 
-        config_file: configuration of the process. output: descriptor for standard output and error.
-        ready: descriptor that the configuration names; it has the same number in the new process.
+        If this is not possible, close the fork server and return None.
+
+        config_file: configuration of the process.
+        output: descriptor for standard output and error.
+        ready: descriptor for the report that the nodes are ready. The configuration names it, and
+            it has the same number in the new process.
         """
         changed = {
             name: value
@@ -167,7 +178,7 @@ class ForkServer:
         self.close()
 
     def close(self) -> None:
-        """End the fork server; the processes of the nodes continue."""
+        """End the fork server. The processes of the nodes continue to run."""
         self._end()
         self._socket.close()
 
@@ -175,8 +186,10 @@ class ForkServer:
 def serve(socket_fd: int) -> str:
     """Import the modules of the nodes, then fork a process for each request of the launcher.
 
-    The function returns only in the forked processes; its result is the path of their
-    configuration. socket_fd: descriptor of the socket to the launcher.
+    The function returns only in the forked processes. Its result is the path of the configuration
+    of the new process.
+
+    socket_fd: descriptor of the socket to the launcher.
     """
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(os.environ[PARENT_VARIABLE]):
@@ -230,7 +243,9 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
     """Fork a process, and make the launcher its parent.
 
     Returns True in the new process, and False in the fork server. The new process ends if the
-    launcher has not received its process id. descriptors: files that the process inherits.
+    launcher has not received the id of the new process.
+
+    descriptors: files that the process inherits.
     """
     pid_read, pid_write = os.pipe()
     go_read, go_write = os.pipe()
@@ -265,7 +280,7 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
 def _write_arguments(arguments: list[str]) -> None:
     """Replace the arguments of this process in /proc, because tools identify nodes by them.
 
-    The remaining space is filled by an argument of spaces before the last two arguments. Raises
+    An argument of spaces, before the last two arguments, fills the remaining space. Raises
     ValueError if the space is too small.
     """
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()

@@ -1,8 +1,8 @@
 """Publish the state of a host, and latch emergency stops for nodes that start later.
 
 A host is one computer of the graph, and an arm bridge is the node that controls an arm. When a
-bridge restarts, the tool or node that published the emergency stop (e-stop) may have exited. Each
-launcher therefore stores the last e-stop and publishes it to the nodes of its host, until a
+bridge restarts, the tool or node that published the emergency stop (e-stop) has possibly exited.
+Each launcher therefore stores the last e-stop and publishes it to the nodes of its host, until a
 permitted writer resets it. If the arms are armed manually, the launcher also stores the e-stop in a
 file, so that it survives the exit of all launchers.
 """
@@ -48,7 +48,7 @@ from flexsheet.nodes.stop_socket import StopSocket
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 REASON_LENGTH = 1000
-"""The maximum number of characters of an e-stop's reason, so that it fits into all messages."""
+"""The maximum number of characters of an e-stop's reason, so that it fits into every message."""
 
 RESET_WITHIN_S = 5.0
 """The time (s) in which all arms must confirm the reset of an e-stop."""
@@ -62,8 +62,10 @@ Pids = Callable[[], dict[str, int]]
 class HostAgent:
     """A part of the launcher that publishes the status of its host and latches e-stops.
 
-    The agent works between the calls of `start` and `close`. code: git commit that `HostStatus`
-    reports. pids: function that returns the process ids of the running nodes by node name.
+    The agent works between the calls of `start` and `close`.
+
+    code: git commit that `HostStatus` reports.
+    pids: function that returns the process ids of the running nodes by node name.
     """
 
     def __init__(
@@ -116,7 +118,7 @@ class HostAgent:
         self._nice_denied = bool(list_denied(nodes))
 
     def start(self) -> None:
-        """Subscribe to e-stops and start to publish; this requires a running event loop."""
+        """Subscribe to e-stops and start to publish. An event loop must be running."""
         self._stop_socket.open()
         stored = None if self._file is None else self._file.read()
         if stored is not None:
@@ -155,14 +157,14 @@ class HostAgent:
         return subscriber
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Replace the keys of all sockets by the reloaded keys."""
+        """Replace the keys of all sockets by keys that were loaded again."""
         for publisher in self.publishers.values():
             publisher.renew_keys(change)
         for subscriber in self._subscribers:
             subscriber.renew_keys(change)
 
     async def close(self) -> None:
-        """Stop publishing and close all sockets; further calls have no effect."""
+        """Stop publishing, and close all sockets. Further calls have no effect."""
         self._stop_socket.close()
         for task in (self._task, self._resetting):
             if task is not None:
@@ -174,8 +176,7 @@ class HostAgent:
             publisher.close()
 
     def _stop(self, reason: str) -> None:
-        """Engage an e-stop that the command `flexsheet arms stop` has sent through the local
-        socket."""
+        """Engage an e-stop that `flexsheet arms stop` has sent through the local socket."""
         writer = tools_on(self._host)
         self._on_problem(_describe_estop(writer, reason))
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
@@ -250,7 +251,7 @@ class HostAgent:
             self._update_file()
 
     def _update_file(self) -> None:
-        """Write or remove the file of the latched e-stop; if this fails, retry periodically."""
+        """Write or remove the file of the latched e-stop. If this fails, try again periodically."""
         if self._file is None:
             return
         try:
@@ -359,7 +360,7 @@ def has_estop(state: ArmState) -> bool:
 def list_arms(plan: ResolvedGraph) -> list[str]:
     """Return the network addresses of the arms.
 
-    An arm without an address is represented by "host/node" of its bridge.
+    If an arm has no address, it is represented by the text "host/node" of its bridge.
     """
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]

@@ -1,8 +1,8 @@
 """Manage the key pairs with which the hosts of a graph authenticate each other.
 
 The secret key of a host is stored in `directory()`, in a file with the host's name. The public key
-is the value of `hosts.NAME.key` in the launch file. A key ring file in the run's directory contains
-the keys that the processes of a host need.
+of a host is the value of `hosts.NAME.key` in the launch file. A key ring file in the run's
+directory contains the keys that the processes of a host need.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ def secret_file(host: str) -> Path:
 def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
     """Write the key ring files of a run, load them, and return the key rings by host.
 
-    host: host of the key ring file; None for all hosts. Raises BadInputError if a key is missing
-    or invalid.
+    host: host of the key ring file; None for all hosts.
+
+    Raises BadInputError if a key is missing or invalid.
     """
     rings = {}
     problems = []
@@ -72,7 +73,7 @@ class KeyWatch:
         self._read_ns = 0
 
     def read_changes(self) -> dict[str, KeyChange]:
-        """Update the key ring files, and return the key changes since the last call, by host.
+        """Update the key ring files, and return the key changes by host since the last call.
 
         Raises BadInputError, SecurityError and OSError if a file cannot be read or is invalid.
         """

@@ -31,7 +31,7 @@ class NoSoftBodyError(FlexsheetError, RuntimeError):
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
-    """Compute the tables that planners and renderers of a graph need and that the cache lacks."""
+    """Compute the tables that are not cached and that a graph's planners and renderers need."""
     scene = plan.scene_message()
     if scene is None:
         return
@@ -53,7 +53,9 @@ def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal[
 def precompute_deflection_shapes(
     scene: Scene, cache_dir: Path | str | None, progress: Progress
 ) -> Path:
-    """Return the file with the deflection shapes of a scene's sheet; compute it if it is missing.
+    """Return the file with the deflection shapes of a scene's sheet.
+
+    The shapes are computed if the file does not exist.
 
     If the membrane model finds no equilibrium, the reason is reported and no file is written. The
     renderer then approximates the pushed sheet by four triangles.
@@ -73,8 +75,9 @@ def precompute_deflection_shapes(
 def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
     """Return a function (done, total) that reports the progress and the remaining time in steps.
 
-    If `total` changes, or `done` decreases, the reports start again. what: name of the computation
-    in the reports.
+    If `total` changes, or `done` decreases, the reports start again.
+
+    what: name of the computation in the reports.
     """
     from flexsheet.nodes.cache import EtaEstimator
 
@@ -94,7 +97,9 @@ def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None
 
 
 def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
-    """Return the file with the force table of a scene's sheet; compute it if it is missing.
+    """Return the file with the force table of a scene's sheet.
+
+    The table is computed if the file does not exist.
 
     Raises NoEquilibriumError if the membrane model finds no equilibrium.
     """
@@ -112,11 +117,16 @@ def precompute_soft_body(
     scheduler: str | None,
     progress: Progress,
 ) -> Path:
-    """Return the file with the nonlinear table of a soft body; compute it if it is missing.
+    """Return the file with the nonlinear table of a soft body.
 
-    skin_spacing_m: spacing of the nodes at the surface. scheduler: address of a dask.distributed
-    scheduler; None computes on this computer. Raises NoSoftBodyError if the scheduler cannot be
-    used, the body cannot be meshed, or memory is insufficient.
+    The table is computed if the file does not exist.
+
+    skin_spacing_m: spacing of the nodes at the surface.
+    scheduler: address of a dask.distributed scheduler; None: the table is computed on this
+        computer.
+
+    Raises NoSoftBodyError if the scheduler cannot be used, the body cannot be meshed, or memory is
+    insufficient.
     """
     from flexsheet.nodes.cache import EtaEstimator
     from flexsheet.nodes.fem_solver import body, precompute_table

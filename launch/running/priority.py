@@ -1,4 +1,4 @@
-"""Determine the minimum niceness (highest priority) that the user may give to processes."""
+"""Determine the minimum niceness (highest priority) that the user is permitted to set."""
 
 from __future__ import annotations
 
@@ -30,19 +30,22 @@ def _has_cap_sys_nice() -> bool:
 
 
 def min_node_nice() -> int:
-    """Return the minimum niceness of a node that the user may set or that this process already
-    has."""
+    """Return the minimum niceness that is permitted for a node.
+
+    This is the minimum that the user is permitted to set, or the niceness of this process if it is
+    lower.
+    """
     return min(min_nice_step(), os.getpriority(os.PRIO_PROCESS, 0))
 
 
 def list_denied(nodes: Sequence[ResolvedNode]) -> list[str]:
-    """Return the names of the nodes with a niceness that is not permitted."""
+    """Return the names of the nodes whose niceness is not permitted."""
     minimum = min_node_nice()
     return [node.name for node in nodes if node.nice < minimum]
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Return a text about nodes with a niceness that is not permitted; None if there are none."""
+    """Return a text about nodes whose niceness is not permitted, or None if there are none."""
     names = list_denied(nodes)
     if not names:
         return None

@@ -67,7 +67,7 @@ class Run:
 
     @property
     def host(self) -> str | None:
-        """Return the host of the started nodes; None if the run started all nodes."""
+        """Return the host whose nodes the run started, or None if it started all nodes."""
         try:
             return (self.directory / HOST_FILE).read_text()
         except FileNotFoundError:
@@ -78,7 +78,7 @@ class Run:
         return (self.directory / _LAUNCHER_FILE).exists() and launcher_is_alive(self.id)
 
     def end(self) -> None:
-        """Remove the sockets and the launcher's marker file; the plan and the logs remain."""
+        """Remove the sockets and the launcher's marker file. The plan and the logs remain."""
         for entry in self.directory.iterdir():
             if stat.S_ISSOCK(entry.lstat().st_mode) or entry.name == _LAUNCHER_FILE:
                 entry.unlink(missing_ok=True)
@@ -97,8 +97,7 @@ def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Replace the placeholder of the run's directory in endpoints of sources by the directory's
-    path."""
+    """Replace the placeholder of the run's directory in the endpoints of sources by the path."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(
@@ -108,8 +107,10 @@ def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
 
 
 def root() -> Path:
-    """Return the folder of this user's runs; its path is short, because socket paths are
-    limited."""
+    """Return the folder of this user's runs.
+
+    Its path is short, because the length of socket paths is limited.
+    """
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")
 
 
@@ -187,8 +188,10 @@ def find_orphans() -> list[psutil.Process]:
 
 
 def sweep() -> list[int]:
-    """End orphaned processes, clean up the directories of ended runs, and return the process
-    ids."""
+    """End orphaned processes, and clean up the directories of ended runs.
+
+    Return the ids of the processes that were ended.
+    """
     import psutil
 
     found = find_orphans()
@@ -249,8 +252,7 @@ def _pid_namespace(pid: int | str = "self") -> int:
 
 
 def _start_ticks(pid: int) -> int | None:
-    """Return the start time of a process in clock ticks since boot; None if the process has
-    ended."""
+    """Return the start time of a process in clock ticks since boot, or None if it has ended."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):

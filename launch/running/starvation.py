@@ -13,8 +13,10 @@ RUNNABLE = "R"
 class ProcessorTime:
     """The kernel counters of the main thread of a process since its start.
 
-    run_s: time on a processor core. wait_s: time that the thread waited for a core, until the
-    thread last ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
+    run_s: time on a processor core.
+    wait_s: time that the thread waited for a core. It includes only waits that ended before the
+        thread last ran.
+    state: letter in /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float
@@ -23,7 +25,7 @@ class ProcessorTime:
 
     @classmethod
     def read(cls, process: int) -> Self | None:
-        """Read the counters of a process; return None if the process has ended.
+        """Read the counters of a process, or return None if the process has ended.
 
         process: process id.
         """
@@ -44,7 +46,7 @@ def compute_starved_s(
     """Return the time (s) that a process waited for a processor core between two readings.
 
     The result is at most `elapsed_s`. The kernel adds a wait to its counter only when the wait
-    ends. If the process is still waiting, all time without a core counts as a wait.
+    ends. If the process is still waiting, all time in which it had no core counts as a wait.
     """
     if before is None or now is None:
         return 0.0

@@ -4,12 +4,10 @@ All launchers and arm bridges (nodes that control an arm) on this computer have 
 (`nodes.stop_socket`). The steps are:
 
 1. All sockets get the request simultaneously. A launcher stores the stop and publishes it to all
-   hosts; a bridge stops its own arm.
-2. Receivers that do not answer get SIGCONT, because they may be suspended.
-3. If no launcher has answered, the bridges that do not answer are killed. The watchdogs of their
-   arms then stop the arms.
-4. If no receiver has answered, the nodes that send sheet targets are killed. Without targets, the
-   bridges on all hosts stop.
+hosts. A bridge stops its own arm. 2. Receivers that do not answer get SIGCONT, because they may be
+suspended. 3. If no launcher has answered, the bridges that do not answer are killed. The watchdogs
+of their arms then stop the arms. 4. If no receiver has answered, the nodes that send sheet targets
+are killed. If the bridges receive no targets, they stop their arms on all hosts.
 
 This module imports few other modules, so that the stop is sent without delay.
 """
@@ -48,10 +46,12 @@ class StopPath(StrEnum):
 class StopOutcome(StrEnum):
     """The outcome of an attempt to stop.
 
-    confirmed: the receiver has engaged the stop. silent: the stop was sent but not confirmed.
-    absent: no process listens. published: the stop was sent on the topic, without confirmation.
-    refused: the stop was not sent, because another tool uses the endpoint of the topic. killed: the
-    process was killed.
+    confirmed: the receiver has engaged the stop.
+    silent: the stop was sent, but the receiver has not confirmed it.
+    absent: no process listens.
+    published: the stop was sent on the topic `estop`, which gives no confirmation.
+    refused: the stop was not sent, because another tool uses the endpoint of the topic.
+    killed: the process was killed.
     """
 
     CONFIRMED = "confirmed"
@@ -66,8 +66,10 @@ class StopOutcome(StrEnum):
 class StopAttempt:
     """An attempt to stop the arms.
 
-    path: means of sending. receiver: name of the receiver. outcome: result. after_ms: time from the
-    first request to the outcome.
+    path: means by which the stop was sent.
+    receiver: name of the receiver.
+    outcome: result of the attempt.
+    after_ms: time from the first request to the outcome.
     """
 
     path: StopPath
@@ -108,14 +110,17 @@ def send_early(arguments: Sequence[str]) -> None:
 
 
 sent_early: list[list[StopAttempt]] = []
-"""The attempts of `send_early`, which the command reports later: an empty list, or one list."""
+"""The attempts of `send_early`, which the command reports later.
+
+If `send_early` was called, this list contains one list of attempts. Otherwise, it is empty.
+"""
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
     """Engage the e-stop in the runs with these directories, and return all attempts.
 
-    The function waits at most KILL_AFTER_S for answers before it kills processes. The module
-    docstring describes the steps.
+    The module docstring describes the steps. The function waits at most KILL_AFTER_S for answers
+    before it kills processes.
     """
     started_s = time.monotonic()
     attempts: list[StopAttempt] = []
@@ -175,7 +180,9 @@ def _send_request(file: Path, request: bytes) -> socket.socket | None:
 
 
 def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Wait for confirmations until `until_s`; remove the receivers that confirm, and return them.
+    """Wait for confirmations until `until_s`.
+
+    Receivers that confirm are removed from `waiting` and returned.
 
     until_s: time of the monotonic clock, s.
     """

@@ -4,11 +4,11 @@
         await graph.wait_ready()
         ...
 
-Every process is a separate session. A process runs one node, or all nodes whose launch file entry
-names the same process. It reports through a pipe that its nodes are ready. When the process exits,
-its restart policy is applied. To stop a process, the launcher sends SIGINT, SIGTERM and finally
-SIGKILL. The launcher needs no threads: the event loop reads exits from pidfds, and logs and
-readiness from pipes.
+Every process is a separate session. A process runs one node, or all nodes that name the same
+process in the launch file. It reports through a pipe that its nodes are ready. When it exits, its
+restart policy is applied. To stop a process, the launcher sends SIGINT, SIGTERM and finally
+SIGKILL. The launcher needs no threads. Its event loop learns from pidfds that processes have
+exited, and reads logs and readiness from pipes.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
 LIVENESS_PERIOD_S = 0.5
 STACK_DUMP_S = 0.5
-"""The time (s) from the request to a hanging node to log its call stacks to its end by SIGKILL."""
+"""The time (s) for which a hanging node can log its call stacks before SIGKILL ends it."""
 
 FORK_SERVER = "fork-server"
 LOG_READ_BYTES = 65_536
@@ -85,8 +85,10 @@ GROUP_REAPS, GROUP_REAP_S = 20, 0.1
 """The number of attempts to reap the child processes of a node, and the time (s) between them."""
 
 Report = Callable[[str, str], None]
-"""A function that is called with (node, line) for each log line; the launcher has the name
-"launch"."""
+"""A function that is called with (node, line) for each log line.
+
+For log lines of the launcher, `node` is "launch".
+"""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
@@ -183,10 +185,11 @@ class Child:
     async def wait_until_silent(self, seconds: float, on_starved: Callable[[float], None]) -> None:
         """Wait until the process has sent no heartbeat for `seconds`.
 
-        The silence is the number of the launcher's polls times their period. Clock time is not
-        used, because a suspended launcher would receive no heartbeats either. Waiting time for a
-        processor core does not count. If only this subtraction prevents the timeout, `on_starved`
-        is called once with the subtracted time (s).
+        The duration of the silence is the number of the launcher's polls multiplied by their
+        period. Clock time is not used, because a launcher that was suspended received no heartbeats
+        either. Waiting time for a processor core does not count. If the timeout is prevented only
+        because this waiting time is subtracted, `on_starved` is called once with the subtracted
+        time (s).
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)
@@ -206,15 +209,16 @@ class Child:
                 on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Request Python's fault handler to write the call stacks to the log, then kill the
-        process."""
+        """Let Python's fault handler write the call stacks to the log, then kill the process."""
         self._reports = False
         self.signal(signal.SIGABRT)
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy available output to the log, and report its lines; return False if there was no
-        output."""
+        """Copy available output to the log, and report its lines.
+
+        Return False if there was no output.
+        """
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -228,7 +232,10 @@ class Child:
         return True
 
     def _handle_line(self, line: bytes) -> None:
-        """Report an output line, and write it to the log of its node, or of the process."""
+        """Report an output line, and write it to the log of its node.
+
+        If the line belongs to no node, it is written to the log of the process.
+        """
         node = self._find_node(line)
         self._logs[node].write(line + b"\n")
         if self._reports:
@@ -307,9 +314,10 @@ def _start_python(
 class RunningGraph:
     """A supervisor of the processes that run the nodes of a graph.
 
-    host: host of the nodes to start; None starts all nodes on this computer. without: names of
-    nodes that are not started. report: function that is called with (node, line) for every log
-    line. The folder `run.logs` also contains all lines.
+    host: host of the nodes to start; None: the nodes of all hosts are started on this computer.
+    without: names of nodes that are not started.
+    report: function that is called with (node, line) for every log line. The folder `run.logs` also
+        contains all lines.
     """
 
     def __init__(
@@ -343,14 +351,17 @@ class RunningGraph:
 
     @property
     def run(self) -> Run:
-        """Return the run, with its directory, logs and id; raise RuntimeError before the start."""
+        """Return the run, with its directory, logs and id.
+
+        Raises RuntimeError if the graph has not been started.
+        """
         if self._run is None:
             raise RuntimeError("the graph has no run before its start; enter its context first")
         return self._run
 
     @property
     def pids(self) -> dict[str, int]:
-        """Return the process ids of the running nodes; nodes in one process have the same id."""
+        """Return the process ids of the running nodes. Nodes in one process have the same id."""
         return {
             node.name: child.pid
             for name, child in self._children.items()
@@ -376,7 +387,8 @@ class RunningGraph:
     async def wait_ready(self, timeout_s: float | None = None) -> None:
         """Wait until all nodes are ready.
 
-        Raises NodeFailedError if a node fails, and TimeoutError after `timeout_s`.
+        Raises NodeFailedError if a node fails, and TimeoutError if nodes are not ready after
+        `timeout_s`.
         """
         waiting = [asyncio.ensure_future(event.wait()) for event in self._ready.values()]
         everyone = asyncio.ensure_future(asyncio.gather(*waiting))
@@ -414,7 +426,7 @@ class RunningGraph:
             await asyncio.sleep(0.02)
 
     async def wait(self) -> None:
-        """Wait until all nodes have exited; raise NodeFailedError if a node fails."""
+        """Wait until all nodes have exited. Raises NodeFailedError if a node fails."""
         pending: set[asyncio.Task[None]] = set(self._supervisors.values())
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
@@ -438,7 +450,10 @@ class RunningGraph:
         self._send(signal.SIGKILL, self._children.values())
 
     def _send(self, number: int, children: Collection[Child]) -> None:
-        """Send a signal to processes; before SIGKILL, report bags that may become incomplete."""
+        """Send a signal to processes.
+
+        If the signal is SIGKILL, bags that may become incomplete are reported first.
+        """
         for bag in self._list_open_bags(children) if number == signal.SIGKILL else ():
             self._report(
                 LAUNCHER,
@@ -462,7 +477,7 @@ class RunningGraph:
     async def stop(self) -> None:
         """End all nodes by SIGINT, SIGTERM and SIGKILL, and remove sockets.
 
-        The method may be called twice.
+        This method can be called twice.
         """
         self._stopping = True
         watches = [] if self._keys_watch is None else [self._keys_watch]
@@ -493,8 +508,9 @@ class RunningGraph:
     async def _end_children(self) -> None:
         """End all processes.
 
-        Simulated arms end after their bridges, because bridges send stop commands to them. Nodes
-        that only read topics end last, to receive the final messages.
+        Simulated arms end after their bridges (the nodes that control them), because bridges send
+        stop commands to the arms. Nodes that only read topics end last, to receive the final
+        messages.
         """
         readers = {
             name
@@ -551,7 +567,7 @@ class RunningGraph:
     def publish_scene(self, scene: Scene) -> int:
         """Replace the scene of the running graph, and return the source timestamp of the message.
 
-        Raises RuntimeError if a node of the graph publishes the scene, such as the console.
+        Raises RuntimeError if a node of the graph, such as the console, publishes the scene.
         """
         source_ns = self._publish_latched("scene", scene)
         if source_ns is None:
@@ -559,7 +575,9 @@ class RunningGraph:
         return source_ns
 
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
-        """Publish a message that later subscribers also receive; return its source timestamp (ns).
+        """Publish a message that later subscribers also receive.
+
+        Return the source timestamp (ns) of the message.
 
         Returns None if there is no message, or if the launcher is not a writer of the topic.
         """
@@ -613,8 +631,10 @@ class RunningGraph:
         )
 
     async def _watch_keys(self) -> None:
-        """Detect key changes in the launch file and the user's key files, and send them to the
-        processes."""
+        """Detect changed keys in the launch file and the user's key files.
+
+        The changes are sent to the processes.
+        """
         watch = KeyWatch(self.plan, self.run, self._rings)
         reported = ""
         while True:
@@ -638,7 +658,7 @@ class RunningGraph:
     async def _supervise(self, process: ResolvedProcess) -> None:
         """Run a process, and restart it according to its policy.
 
-        Raises NodeFailedError if the process fails too often.
+        Raises NodeFailedError if the process fails more often than the policy allows.
         """
         policy, name = process.settings.restart, process.name
         recent: deque[float] = deque()
@@ -668,8 +688,10 @@ class RunningGraph:
                 self.restarts[node.name] += 1
 
     async def _run_once(self, process: ResolvedProcess) -> str | None:
-        """Run a process until it ends; return a text about its failure, or None if it did not
-        fail."""
+        """Run a process until it ends.
+
+        Return a text about the failure of the process, or None if it did not fail.
+        """
         child = await self._spawn(process)
         late = await self._is_late(child, process)
         if late:
@@ -716,7 +738,10 @@ class RunningGraph:
         self.exit_codes.update(dict.fromkeys((node.name for node in process.nodes), code))
 
     async def _detect_hang(self, child: Child, process: ResolvedProcess) -> bool:
-        """Monitor a process until it exits or hangs; end a hanging process and return True."""
+        """Monitor a process until it exits or hangs.
+
+        If it hangs, end the process and return True.
+        """
         liveness_s = process.settings.liveness_s
         if liveness_s is None:
             return False
@@ -807,8 +832,10 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the scene file as JSON, for the nodes that publish
-        scenes."""
+        """Write all scenes in the folder of the scene file as JSON.
+
+        Nodes that publish scenes read these files.
+        """
         folder.mkdir()
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
@@ -847,7 +874,10 @@ def _describe_process(process: ResolvedProcess) -> str:
 
 
 def list_written_files(pid: int) -> list[Path]:
-    """Return the regular files that a process has open for writing; none if it has ended."""
+    """Return the regular files that a process has open for writing.
+
+    The result is empty if the process has ended.
+    """
     try:
         entries = list(Path(f"/proc/{pid}/fd").iterdir())
     except OSError:
@@ -864,7 +894,10 @@ def list_written_files(pid: int) -> list[Path]:
 
 
 def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
-    """Return the configuration of a node in a run, with the run's directory in the endpoints."""
+    """Return the configuration of a node in a run.
+
+    In the endpoints, the placeholder of the run's directory is replaced by its path.
+    """
 
     def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
@@ -914,7 +947,7 @@ def _clocks_port(plan: ResolvedGraph, host: str, run: Run) -> PortConfig | None:
 
 
 def describe_exit(code: int) -> str | None:
-    """Return a text about the failure that an exit code indicates; None for exit code 0."""
+    """Return a text about the failure that an exit code indicates, or None if the code is 0."""
     if code == 0:
         return None
     if code < 0:

@@ -17,7 +17,7 @@ TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
 NETWORK = TEMPLATE.with_name("90-flexsheet.conf")
 SOFTWARE = Path(__file__).resolve().parents[2]
 STATE_FOLDER = Path("/var/lib/flexsheet")
-"""The only folder that the systemd service may write to."""
+"""The only folder to which the systemd service is allowed to write."""
 SOCKET_VARIABLE, WATCHDOG_VARIABLE = "NOTIFY_SOCKET", "WATCHDOG_USEC"
 
 
@@ -38,9 +38,9 @@ class SystemFile:
 
 
 def make_files(*, launch_file: Path, host: str, user: str, root: Path) -> Iterator[SystemFile]:
-    """Yield the systemd unit, the kernel's TCP settings, and the environment file of a host.
+    """Yield the systemd unit, the kernel's TCP settings and the environment file of a host.
 
-    root: root folder of the file system; "/" except in tests.
+    root: root folder of the file system, which is "/" except in tests.
     """
     command = Path(sys.executable).parent / "flexsheet"
     unit = TEMPLATE.read_text()

@@ -1,7 +1,7 @@
 """Read and write topics of a running graph from command-line tools and experiments.
 
-On the main host, tools may write the topics that no node writes. On other hosts, tools may write
-only e-stops. Tools authenticate with the keys of their host.
+On the main host, tools are allowed to write the topics that no node writes. On other hosts, they
+are allowed to write only e-stops. Tools authenticate with the keys of their host.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""The time (s) in which all subscribers connect to a new writer; they retry every 0.5 s."""
+"""The time (s) in which all subscribers connect to a new writer.
+
+Subscribers try to connect every 0.5 s.
+"""
 
 
 @dataclass(slots=True)
@@ -44,12 +47,12 @@ def tools_host(run: Run) -> str:
 
 
 def list_tool_topics(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
-    """Return the topics of the graph that command-line tools on a host may write."""
+    """Return the topics of the graph that command-line tools on a host are allowed to write."""
     return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
 
 def load_tool_keys(plan: ResolvedGraph, run: Run) -> KeyRing | None:
-    """Return the authentication keys of this host; None if the graph uses no keys."""
+    """Return the authentication keys of this host, or None if the graph uses no keys."""
     return KeyRing(ring_file(run, tools_host(run))) if plan.keys else None
 
 
@@ -62,10 +65,12 @@ def make_subscriber(
     on_problem: Problem,
     raw: bool = False,
 ) -> Subscriber:
-    """Return a subscriber to all writers of a topic in a running graph; the caller must start it.
+    """Return a subscriber to all writers of a topic in a running graph.
 
-    raw: whether `on_message` receives undecoded messages. on_problem: function that is called with
-    the text of an error.
+    The caller must start the subscriber.
+
+    raw: whether `on_message` receives undecoded messages.
+    on_problem: function that is called with the text of an error.
     """
     definition = find_topic(topic)
     return Subscriber(
@@ -84,10 +89,13 @@ def make_subscriber(
 async def read_topic(
     graph: RunningGraph, topic: str, count: int | None = None
 ) -> AsyncIterator[tuple[Message, Header]]:
-    """Yield the messages of a topic of a running graph with their headers as they arrive.
+    """Yield the messages of a topic of a running graph, with their headers, as they arrive.
 
-    count: number of messages; None for no limit. If the caller is slow, messages wait in a queue.
-    Raises KeyError for a topic that does not exist.
+    If the caller is slow, messages wait in a queue.
+
+    count: number of messages; None for no limit.
+
+    Raises KeyError if the topic does not exist.
     """
     # Import the module here, so that commands that do not call this function start faster.
     import structlog
@@ -109,10 +117,12 @@ async def read_topic(
 
 
 class GraphWriter:
-    """A publisher of topics for tools outside the running graph; it requires a running event loop.
+    """A publisher of topics for tools outside the running graph.
 
-    The constructor raises BadInputError for a topic that tools may not write. It raises BusError
-    for a topic that another tool is writing.
+    It requires a running event loop.
+
+    The constructor raises BadInputError if tools are not allowed to write a topic. It raises
+    BusError if another tool is already writing the topic.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
@@ -136,7 +146,7 @@ class GraphWriter:
     def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
         """Send a message with the next sequence number.
 
-        source_ns: source timestamp of the data; None for the present time.
+        source_ns: source timestamp of the data; None: the present time.
         """
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
         now_ns = self._clock.now_ns()
@@ -159,7 +169,7 @@ class GraphWriter:
 
 
 def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
-    """Return the error that is raised for a topic that tools on a host may not write."""
+    """Return the error that is raised if tools on a host are not allowed to write a topic."""
     from flexsheet.launch.plans import documents
 
     may = ", ".join(list_tool_topics(plan, host))

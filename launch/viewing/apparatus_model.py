@@ -1,4 +1,4 @@
-"""Describe the arms, camera, projector and sheet of a scene by links and joints, as in URDF.
+"""Describe the arms, cameras, projector and sheet of a scene by links and joints, as in URDF.
 
 Links of each arm: `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`,
 where SIDE is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`, `projector`
@@ -73,8 +73,8 @@ class JointLimit:
 class Joint:
     """A joint between two links.
 
-    parent_from_child: pose (4, 4) of the child at joint angle zero. limit: axis and range of a
-    revolute joint; None for a fixed joint.
+    parent_from_child: pose (4, 4) of the child at joint angle zero.
+    limit: axis and range of a revolute joint; None for a fixed joint.
     """
 
     name: str
@@ -84,7 +84,10 @@ class Joint:
     limit: JointLimit | None = None
 
     def pose(self, angle_rad: float) -> Floats:
-        """Return the pose (4, 4) of the child link; the angle of a fixed joint has no effect."""
+        """Return the pose (4, 4) of the child link.
+
+        If the joint is fixed, the angle has no effect.
+        """
         if self.limit is None:
             return self.parent_from_child
         rotation = rotation_from_vector(angle_rad * np.array(self.limit.axis))
@@ -93,7 +96,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class ApparatusModel:
-    """The links and joints of the apparatus; parent links precede their child links."""
+    """The links and joints of the apparatus. Parent links precede their child links."""
 
     name: str
     links: tuple[Link, ...]
@@ -102,7 +105,7 @@ class ApparatusModel:
     def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Floats]:
         """Return the world poses (4, 4) of all links, by name.
 
-        angles_rad: joint angles by joint name; missing angles are zero.
+        angles_rad: joint angles by joint name. If an angle is missing, it is zero.
         """
         found = {WORLD: np.eye(4)}
         for joint in self.joints:
@@ -114,7 +117,7 @@ def make_model(scene: Scene) -> ApparatusModel:
     """Return a model of both arms with clamps, the stereo camera, the projector and the screen.
 
     The screen is the unstretched sheet at the origin of the world. The joint angles of the model
-    equal the readings of the encoders.
+    are equal to the readings of the joint encoders.
     """
     links, joints = [Link(WORLD)], []
     for side in get_args(Side):
@@ -130,7 +133,7 @@ def make_model(scene: Scene) -> ApparatusModel:
 def solve_rest_joints(scene: Scene) -> dict[str, float]:
     """Return the joint angles (rad), by name, of arms that hold the sheet at the screen.
 
-    If an arm cannot reach the screen, its joint angles are the centres of their ranges.
+    If an arm cannot reach the screen, each of its joint angles is the centre of the joint's range.
     """
     angles: dict[str, float] = {}
     for side in get_args(Side):
@@ -186,7 +189,7 @@ def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
 
 
 def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]:
-    """Yield name, world pose (4, 4) and boxes of both cameras, the projector and the screen."""
+    """Yield the name, world pose (4, 4) and boxes of each camera, the projector and the screen."""
     left = pose_matrix(scene.camera.world_from_left)
     yield "camera_left", left, _make_device(CAMERA_BODY_M, 0.02)
     right = left @ inverse(np.asarray(scene.camera.right_from_left))
@@ -203,7 +206,10 @@ def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]
 def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:
     """Return boxes for the housing and the lens of a device that faces +z.
 
-    The centre of the lens is the origin. body_m: size of the housing. lens_m: width of the lens.
+    The centre of the lens is the origin.
+
+    body_m: size of the housing.
+    lens_m: width of the lens.
     """
     depth_m = body_m[2]
     return (

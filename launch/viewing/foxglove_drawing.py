@@ -47,7 +47,8 @@ def draw_mesh(
 ) -> Any:
     """Make a Foxglove scene update that draws a triangle mesh.
 
-    vertices: (n, 3), m. triangles: (k, 3), vertex indices.
+    vertices: positions (n, 3) of n vertices, m.
+    triangles: vertex indices (k, 3) of k triangles.
     """
     surface = fg.TriangleListPrimitive(
         pose=make_pose(np.eye(4)),
@@ -59,7 +60,10 @@ def draw_mesh(
 
 
 def draw_finger(message: Fingertip, radius_m: float, stamp: Any) -> Any:
-    """Make a Foxglove scene update that draws the fingertip as a sphere and its predicted path."""
+    """Make a Foxglove scene update that draws the fingertip and its predicted path.
+
+    The fingertip is drawn as a sphere.
+    """
     colour = FINGER_COLOUR if message.valid else LOST_COLOUR
     path = fg.LinePrimitive(
         type=fg.LinePrimitiveLineType.LineStrip,

@@ -27,7 +27,7 @@ _visual: Any = trimesh.visual
 
 
 def make_glb(model: ApparatusModel, angles_rad: Mapping[str, float]) -> bytes:
-    """Return the model as binary glTF at the given joint angles.
+    """Return the model, at the given joint angles, as binary glTF.
 
     angles_rad: joint angles by joint name.
     """
@@ -35,7 +35,7 @@ def make_glb(model: ApparatusModel, angles_rad: Mapping[str, float]) -> bytes:
 
 
 def make_gltf(model: ApparatusModel, angles_rad: Mapping[str, float]) -> str:
-    """Return the model as glTF JSON with embedded meshes at the given joint angles.
+    """Return the model, at the given joint angles, as glTF JSON with embedded meshes.
 
     angles_rad: joint angles by joint name.
     """

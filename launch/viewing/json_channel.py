@@ -1,7 +1,7 @@
 """Convert messages to JSON that viewers can list and plot.
 
-Foxglove and Lichtblick reject nested arrays and fields without a type. An array therefore becomes
-one list, row by row, and a field with the value None is omitted.
+Foxglove and Lichtblick reject nested arrays and fields that have no type. An array therefore
+becomes one list, row by row. A field is omitted if its value is None.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from flexsheet.messages.field_types import get_annotation, split_annotation
 
 MAX_ARRAY = 64
-"""The maximum number of elements of an array in a JSON message; larger arrays are omitted."""
+"""The maximum number of elements of an array in a JSON message. Larger arrays are omitted."""
 
 JsonSchema = dict[str, Any]
 _NUMBER: JsonSchema = {"type": "number"}
@@ -33,7 +33,7 @@ def make_schema(kind: type[BaseModel]) -> JsonSchema:
 
 
 def to_json(value: Any) -> Any:
-    """Convert a message to JSON types; omit arrays with more than `MAX_ARRAY` elements."""
+    """Convert a message to JSON types, and omit arrays with more than `MAX_ARRAY` elements."""
     found = _convert(value)
     return None if found is _OMITTED else found
 
@@ -88,8 +88,8 @@ def _describe_type(kind: type) -> JsonSchema:
 def _merge(schemas: list[JsonSchema]) -> JsonSchema:
     """Return one JSON Schema for values of several types.
 
-    The schema of several objects has the fields of all objects. The schema of other combinations
-    is an array or text.
+    If all types have the same schema, it is returned. If all types are objects, the result has the
+    fields of all objects. Otherwise, it is the schema of an array or a text.
     """
     if not schemas:
         return _TEXT

@@ -71,15 +71,17 @@ VIEWER_FROM_WORLD = transform(rotation_from_vector((0.5 * np.pi, 0.0, 0.0)), np.
 EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
 EYE_RADIUS_M = 0.011
 SHEET_STEP = 2
-"""Every SHEET_STEP-th row and column of the sheet's mesh is sent to viewers."""
+"""The step between the rows and columns of the sheet's mesh that are sent to viewers."""
 JPEG_QUALITY = 80
 
 
 class Pace(Enum):
     """The maximum rate of a channel.
 
-    NUMBERS, IMAGES: the configured rate of numbers or images. EACH: not limited. STATIC: when the
-    scene changes, and once per second for viewers that connect later.
+    NUMBERS, IMAGES: the configured maximum rate of numbers or of images.
+    EACH: the rate is not limited; each message is sent.
+    STATIC: a message is sent when the scene changes, and once per second for viewers that connect
+        later.
     """
 
     NUMBERS = "numbers"
@@ -113,7 +115,7 @@ class LiveState:
         return found if isinstance(found, Fingertip) else None
 
     def edges(self) -> tuple[Floats, Floats] | None:
-        """Return the world poses (4, 4) of the left and the right edge; None if one is unknown."""
+        """Return the world poses (4, 4) of the left and right edge, or None if one is unknown."""
         scene, found = self.scene, []
         for side in get_args(Side):
             state = self.latest.get(f"arm_{side}")
@@ -128,10 +130,12 @@ class LiveState:
 class LiveChannel:
     """A channel that viewers can display.
 
-    topics: topics that the channel needs in addition to the scene. triggers: topics that cause the
-    channel to send a message. make: function (state, received message, timestamp) that returns a
-    message of the channel, or None if there is nothing to send. kind: Foxglove type of the
-    messages; empty for JSON. schema: JSON Schema of JSON messages.
+    topics: topics that the channel needs in addition to the scene.
+    triggers: topics that cause the channel to send a message.
+    make: function (state, received message, timestamp) that returns a message of the channel, or
+        None if there is nothing to send.
+    kind: Foxglove type of the messages; empty for JSON.
+    schema: JSON Schema of JSON messages.
     """
 
     name: str

@@ -2,8 +2,8 @@
 
 The server of the Foxglove SDK has no authentication and accepts requests from any web page.
 Therefore the server listens on the loopback interface only. Viewers cannot publish, call services
-or change parameters. Topics are read from the graph only while viewers subscribe to channels that
-need them. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
+or change parameters. A topic is read from the graph only while viewers subscribe to channels that
+need the topic. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ UPDATE_S = 0.1
 STATIC_S = 1.0
 TIME_S = 1.0 / 30.0
 ALWAYS_READ = frozenset({"scene", "status"})
-"""The topics that the server always reads, because they contain scene and parameters."""
+"""The topics that the server always reads, because they contain the scene and the parameters."""
 URDF_PARAMETER = "/robot_description"
 
 
@@ -72,8 +72,10 @@ class ReadOnlyParameters(ServerListener):
 class LiveServer:
     """A server that sends the data of one running graph to viewers in a running event loop.
 
-    rate_hz, image_rate_hz: maximum rates per channel, of numbers and of images and meshes. port:
-    TCP port; 0 selects a free port. on_problem: function that is called with the text of an error.
+    rate_hz, image_rate_hz: maximum rate per channel of numbers, and maximum rate per channel of
+        images and meshes.
+    port: TCP port; 0: a free port is selected.
+    on_problem: function that is called with the text of an error.
     """
 
     def __init__(
@@ -202,7 +204,8 @@ class LiveServer:
     ) -> None:
         """Send a message on a channel if the channel has viewers and its period has elapsed.
 
-        now_ns: present time. source_ns: timestamp of the message.
+        now_ns: present time.
+        source_ns: timestamp of the message.
         """
         sink, key = self._sinks[channel.name], (channel.name, topic)
         if now_ns < self._due_ns.get(key, 0) or not sink.has_sinks():

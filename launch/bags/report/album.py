@@ -37,7 +37,7 @@ class Shot:
 
 @dataclass(slots=True)
 class Album:
-    """A selection of image sets: some at regular intervals, and the first one after each bookmark.
+    """A selection of image sets: sets at regular intervals, and the first set after each bookmark.
 
     limit: maximum number of image sets at regular intervals.
     bookmarks: (time in s, label) of each bookmark, in the order of time.

@@ -31,7 +31,7 @@ STATE_COLOURS = {
 }  # fmt: skip
 HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
-"""The hatch pattern of each state, for readers who cannot distinguish the colours."""
+"""The hatch pattern that represents each state for readers who cannot distinguish the colours."""
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
@@ -95,7 +95,7 @@ def _over_time(axes: Axes, session: Session) -> None:
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Add a marker to each value between two NaNs, because a line does not show such a value."""
+    """Add a marker to each value whose two neighbours are NaN, because a line does not show it."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         has_neighbour = np.zeros_like(known)
@@ -340,7 +340,7 @@ def sheet_errors(session: Session) -> Chart | None:
 
 
 def draw_joint_speeds(session: Session) -> Chart | None:
-    """Draw the maximum speed of each joint against time, in percent of the speed limit.
+    """Draw the maximum speed of each joint against time, as a percentage of its speed limit.
 
     Return None if the bag contains no joint speeds.
     """

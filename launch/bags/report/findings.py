@@ -20,7 +20,7 @@ MAX_LIMIT_RATIO = 1.0
 """The maximum ratio of a value to its limit that is not reported as a problem."""
 
 ROUNDING = 1.02
-"""The factor by which measured values may exceed their limits because of rounding."""
+"""The factor by which measured values can exceed their limits because of rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +37,9 @@ class SessionFinding:
 
 
 BRIEFLY_BUSY_FRACTION = 0.05
-"""The maximum fraction of time for which an overload counts as a possible problem only.
+"""The maximum fraction of time for which an overload is reported only as a possible problem.
 
-A longer overload, or one in which an arm stopped, is reported as a failure.
+A longer overload is reported as a failure. So is an overload during which an arm stopped.
 """
 
 CHECKED = (

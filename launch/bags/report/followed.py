@@ -10,9 +10,9 @@ from flexsheet.launch.bags.report.series import Grid, RunningMoments, Spread
 from flexsheet.nodes.arrays import Floats
 
 MAX_CONTACT_HEIGHT_M = 0.001
-"""The maximum height (m) of the finger above the undeformed object that counts as contact.
+"""The maximum height (m) of the finger above the undeformed object at which it is in contact.
 
-The pad of a fingertip deforms by about this height.
+The pad of a fingertip deforms by about this amount.
 """
 
 
@@ -44,8 +44,8 @@ class Sizes:
 class FollowedFinger:
     """An accumulator of the errors of the true sheet relative to the true finger.
 
-    It also counts drop-outs. A drop-out is an interval in which the arms do not follow the finger,
-    at least partly during contact.
+    It also counts drop-outs. A drop-out is an interval in which the arms do not follow the finger
+    and which contains at least one exposure in contact.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class FollowedFinger:
         contact_ratio: fraction of the exposures that are in contact.
         following_ratio: fraction of the exposures in contact at which the arms follow the finger.
 
-        Values that require contact are None if there was no contact.
+        Values that are only defined during contact are None if there was no contact.
         """
         return {
             "contact_ratio": self._in_contact / self.exposures if self.exposures else None,

@@ -17,7 +17,7 @@ from flexsheet.launch.bags.report.session import Session
 MARK = "<!-- made by: flexsheet bag report -->"
 """The comment by which a report is recognized.
 
-A file without this comment is not overwritten by a report.
+A file is not overwritten by a report if it does not contain this comment.
 """
 
 COLOURS = {
@@ -43,7 +43,10 @@ SECTIONS = {
 
 EVENTS_SHOWN = 60
 BRIEF_S = 0.02
-"""The minimum duration (s) of a state that the page lists. Chart and --json contain all states."""
+"""The minimum duration (s) of a state that the page lists.
+
+The chart and the output of --json contain all states.
+"""
 
 _CSS = """
 * { box-sizing: border-box; }

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from flexsheet.nodes.arrays import Floats
 
 MIN_DURATION_S, MAX_DURATION_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
-"""The minimum and maximum duration (s) in the histogram of `Spread`, and its bins per decade.
+"""The minimum and maximum duration (s) in the histogram of `Spread`, and the bins per decade.
 
 Each bin is 2.3 % wide.
 """
 
 CELLS = 7 * CELLS_PER_DECADE
 MAX_STATE_AGE_S = 0.5
-"""The maximum time (s) for which a state is assumed to last without a new message."""
+"""The maximum time (s) for which a state is assumed to last if no new message arrives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Grid:
 
 
 class Maxima:
-    """The maximum of a quantity in each interval, or NaN without values."""
+    """The maximum of a quantity in each interval, or NaN if an interval contains no values."""
 
     def __init__(self, grid: Grid) -> None:
         self.maximum = np.full(grid.count, np.nan)
@@ -59,7 +59,7 @@ class Maxima:
             self.maximum[index] = value
 
     def overall(self) -> float | None:
-        """Return the maximum over all intervals, or None without values."""
+        """Return the maximum over all intervals, or None if there are no values."""
         return None if np.isnan(self.maximum).all() else float(np.nanmax(self.maximum))
 
 
@@ -99,7 +99,7 @@ class Spread:
     def quantiles_s(self, fraction: float) -> Floats:
         """Return a quantile (count,), in s, of the durations in each interval.
 
-        The quantile is NaN for an interval without durations.
+        The quantile of an interval is NaN if no durations were added to it.
 
         fraction: fraction of the durations that are below the quantile.
         """
@@ -123,7 +123,10 @@ def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
 
 
 class PointSeries:
-    """The last known position (count, 3), in m, of a point in each interval; NaN if unknown."""
+    """The last known position of a point in each of `count` intervals.
+
+    The positions (count, 3) are in m. Unknown positions are NaN.
+    """
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)

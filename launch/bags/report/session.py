@@ -74,7 +74,7 @@ At the end of a session, an arm enters these modes because it is shut down.
 
 MOVING = ("follow", "hold", "relax")
 MAX_END_S = 2.0
-"""The maximum time (s) from the loss of an arm to the shutdown of its node at a session's end.
+"""The maximum time (s) between the loss of an arm and the shutdown of its node at a session's end.
 
 An arm that is lost within this time and does not move again has not failed. Its loss is reported as
 the end of the session.
@@ -87,7 +87,7 @@ class Flow:
 
     age: distribution of the time from the source timestamp to the recording.
     lost: number of missing sequence numbers.
-    silences: number of intervals without messages that are longer than permitted.
+    silences: number of intervals without messages that were longer than permitted.
     longest_silence_s: duration of the longest interval without messages.
     """
 
@@ -293,7 +293,7 @@ class Session:
     def joint_speeds_rad_per_s(self, side: str) -> tuple[float, ...]:
         """Return the maximum joint speeds (6,), in rad/s, of an arm in the scene.
 
-        If no scene was recorded, return the speeds of an RV-1A arm.
+        If no scene was recorded, return the maximum joint speeds of an RV-1A arm.
         """
         model = RV_1A if self.scene is None else getattr(self.scene.arms, side).model
         return tuple(model.speed_rad_per_s)
@@ -511,7 +511,7 @@ def add_correction(label: str, correction: str) -> str:
 
 
 def _list_silence_limits() -> dict[str, float]:
-    """Return the maximum permitted interval (s) without messages, by topic.
+    """Return, for each topic, the maximum permitted time (s) between two messages.
 
     Only topics with an expected rate and a single writer have a limit.
     """

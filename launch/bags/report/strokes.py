@@ -70,7 +70,7 @@ class FingerRun:
     done_ns: time of the last exposure on the path.
     end_ns: time of the last exposure at which the finger reports the path.
     stroke_s: duration of the stroke; None if the path is not a stroke of an experiment.
-    sums: errors during the stroke relative to the measured and to the true finger.
+    sums: errors during the stroke, relative to the measured finger and to the true finger.
     """
 
     label: str

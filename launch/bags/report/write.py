@@ -58,7 +58,7 @@ def _draft_path(output: Path) -> Path:
 def _check(output: Path) -> None:
     """Raise BagError if the page cannot be written.
 
-    The check is made before the bag is read, because reading may take long.
+    The check is made before the bag is read, because reading can take long.
     """
     draft = _draft_path(output)
     try:
