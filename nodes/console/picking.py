@@ -1,4 +1,5 @@
-"""Compute the fingertip position that the mouse selects on the object, and a path to it."""
+"""Compute the fingertip position that the mouse selects on the object, and a path to this position.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +17,13 @@ MIN_STEP_RATIO = 0.01
 """The minimum length of a step around an object, as a fraction of the maximum step length."""
 
 HOVER_M = 0.03
-"""The height of a lifted finger above the object's surface."""
+"""The distance of a lifted finger from the object's surface, in metres."""
 
 
 class SurfacePicker:
-    """A selector of points on the object of a scene. Its construction takes a second for a mesh."""
+    """A selector of points on the object of a scene. If the object is a mesh, the constructor takes
+    a second.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self._world_from_object = pose_matrix(scene.object.world_from_object)
@@ -67,8 +70,9 @@ class SurfacePicker:
         """Return the next point (3,), in m, on the path of the finger to the target.
 
         finger, target: present and requested position (3,), m. The step is at most `max_step_m`
-        long. The step ends at most `depth_m` below the surface, or at the present depth if that is
-        larger. If a step around the object makes no progress, the step is straight.
+        long. The step ends at most `depth_m` below the surface, or at the present depth if the
+        present depth is larger. If a step around the object makes no progress, the step is
+        straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

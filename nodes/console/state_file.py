@@ -56,7 +56,7 @@ class ConsoleState(BaseModel):
 def load_state(path: Path) -> ConsoleState | None:
     """Read the saved state of a console; return None if there is no file.
 
-    Raises SceneChoiceError for an invalid file.
+    Raises SceneChoiceError if the file is invalid.
     """
     try:
         return ConsoleState.model_validate_json(path.read_bytes())
