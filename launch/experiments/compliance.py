@@ -462,7 +462,7 @@ def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | Non
     """Return the mean force (N) that a gauge measured in a rest, or None if there is no
     measurement.
 
-    The averaging interval is longer than that of the true force, because gauges are slow.
+    The averaging interval is longer than the interval for the true force, because gauges are slow.
 
     forces: (k, 2), times (ns) and forces (N).
     begin_ns: start of the finger path.

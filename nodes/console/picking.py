@@ -1,5 +1,4 @@
-"""Compute the fingertip position that the mouse selects on the object, and a path to this position.
-"""
+"""Compute the fingertip position that the mouse selects on the object, and a path to the position."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from flexsheet.nodes.console.scenes import MIN_STRETCH_RATIO, SceneChoiceError
 class Sliders:
     """The positions of the sliders on the console page.
 
-    young_modulus_pa: Young's modulus of the object; None for a rigid object.
+    young_modulus_pa: Young's modulus of the object; None if the object is rigid.
     stretch_ratio: minimum stretch ratio of the sheet.
     size_ratio: size of the object, relative to its size in the scene file.
     """

@@ -90,7 +90,7 @@ class FingerObstacle:
             the body, to which the contact stiffness is proportional. radius_m: radius of the
             finger.
         axis (3,): unit vector from the tip of the finger along its shaft, which is a cylinder of
-            the same radius; None for a sphere.
+            the same radius; None if the finger is a sphere.
         """
         self.radius_m, self._axis = radius_m, axis
         self._count, self._faces = len(nodes), faces
@@ -223,8 +223,8 @@ class NeoHookeanBody:
             precision of the factors of the tangent stiffness; it affects only the search direction.
         mirror_axes: axes of planes of symmetry if the mesh contains only one side of these planes.
             Then the forces contain only the contribution of this side. finger_axis (3,): direction
-            of the finger's shaft; None for a sphere. Raises SolidMeshError if an element is
-            inverted, and ValueError if the material is invalid.
+            of the finger's shaft; None if the finger is a sphere. Raises SolidMeshError if an
+            element is inverted, and ValueError if the material is invalid.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio

@@ -53,8 +53,8 @@ class ProjectionScreen:
 
     point (3,): common vertex, m (r_s in Furukawa et al. 2007). normals (4, 3): unit normals towards
     the user (n_si in the paper). For a plane, the normals are equal. corners (4, 3): corners, m,
-    counter-clockwise as seen by the user; None for a plane. Triangle i is between corner i and the
-    next corner.
+    counter-clockwise as seen by the user; None if the screen is one plane. Triangle i is between
+    corner i and the next corner.
     """
 
     point: Floats

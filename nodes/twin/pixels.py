@@ -211,7 +211,7 @@ class TwinCamera:
         """Render the static background of both cameras.
 
         camera: true lenses and poses of the stereo camera.
-        nail: marker position and finger direction; None for a bead at the fingertip.
+        nail: marker position and finger direction; None if the marker is a bead at the fingertip.
         skew_s: exposure time of the right image minus the exposure time of the left image.
         """
         self.camera = camera

@@ -66,11 +66,11 @@ def cylinder_mesh(
 
     support_angle_rad: full angle of the fixed strip, which is centred on -z. touch_angle_rad: half
     angle of the touchable skin, which is centred on +z. skin_spacing_m: distance between touchable
-    nodes. focus: point around which the mesh is fine; None for a mesh that is fine on all touchable
-    skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for y = 0.
-    The mesh contains only the half with positive coordinates. Elements are larger inside and at the
-    back of the cylinder. Raises ValueError if the spacing is too large for the cylinder, or if the
-    angles are invalid.
+    nodes. focus: point around which the mesh is fine; if it is None, the mesh is fine on all
+    touchable skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for
+    y = 0. The mesh contains only the half with positive coordinates. Elements are larger inside and
+    at the back of the cylinder. Raises ValueError if the spacing is too large for the cylinder, or
+    if the angles are invalid.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
