@@ -1,4 +1,4 @@
-"""Compute the fingertip position that the mouse selects on the object, and a path to the position."""
+"""Compute the fingertip position that the mouse selects on the object, and a path to this point."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class Viewer:
         The point contains a random alignment error. Return None if the sheet is not behind the
         bead.
 
-        bead (3,): position, world frame, m.
+        bead (3,): position of the bead, world frame, m.
         """
         eye = self.locate_eye(side, time_s)
         error = rotation_from_vector(self._random.normal(0.0, ALIGNMENT_RAD, 3))
