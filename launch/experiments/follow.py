@@ -7,8 +7,8 @@ arms. The linear program makes these assumptions:
 - The sheet rolls on the undeformed object without slip, with a constant stretch.
 - Joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
     limited as in the arm bridges. There is no servo lag and no limit of the jerk.
-- While there is no contact, the sheet can move freely. - Joint angles change linearly with small
-deviations of the contact point.
+- While there is no contact, the sheet can move freely.
+- Joint angles change linearly with small deviations of the contact point.
 
 Three simplifications only make the bound smaller. The limits apply to differences between time
 steps. The length of a deviation is replaced by its largest component along fixed directions.
