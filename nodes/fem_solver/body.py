@@ -106,7 +106,7 @@ class SceneBody:
         """Return the response to a fingertip at `point_world` (3,), m, and the new contact anchor.
 
         anchor: contact anchor (pushed surface point) that the previous call returned, or None.
-            Raises ValueError if a coordinate of the point is not finite.
+        Raises ValueError if a coordinate of the point is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:
