@@ -53,7 +53,7 @@ class ArmsNotReadyError(ExperimentError):
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
     """Check names and remove duplicates; if there are no names, return all known names.
 
-    kind: noun for the names in the error text. Raises ExperimentError for an unknown name.
+    kind: noun for the names in the error text. Raises ExperimentError if a name is unknown.
     """
     for name in names:
         if name not in known:

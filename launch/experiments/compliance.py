@@ -279,8 +279,8 @@ class ForceSample:
     def error_ratio(self) -> float:
         """Return the relative error of the felt force.
 
-        The error is relative to the reference force, or to the wanted force without a reference.
-        The divisor is at least FORCE_JND_FLOOR_N.
+        The error is relative to the reference force, or to the wanted force if there is no
+        reference. The divisor is at least FORCE_JND_FLOOR_N.
         """
         expected_n = self.wanted_n if self.reference is None else self.reference.force_n
         return _relative_error(self.felt_n, expected_n)
@@ -459,9 +459,10 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 
 
 def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
-    """Return the mean force (N) that a gauge measured in a rest; None without a measurement.
+    """Return the mean force (N) that a gauge measured in a rest, or None if there is no
+    measurement.
 
-    The averaging interval is longer than that of the true force, because gauges are slow.
+    The averaging interval is longer than the interval for the true force, because gauges are slow.
 
     forces: (k, 2), times (ns) and forces (N).
     begin_ns: start of the finger path.

@@ -285,7 +285,7 @@ class Driver:
     ) -> None:
         """Wait until the soft body uses a table at least as accurate as `method`.
 
-        Without a cached table, a node uses a less accurate method while it computes the table.
+        If the table is not cached, a node uses a less accurate method while it computes the table.
         Return at once if no node uses a table for the scene.
 
         progress: function that receives the node's progress and remaining time.

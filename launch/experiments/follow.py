@@ -7,7 +7,7 @@ arms. The linear program makes these assumptions:
 - The sheet rolls on the undeformed object without slip, with a constant stretch.
 - Joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
     limited as in the arm bridges. There is no servo lag and no limit of the jerk.
-- Without contact, the sheet may move freely.
+- While there is no contact, the sheet can move freely.
 - Joint angles change linearly with small deviations of the contact point.
 
 Three simplifications only make the bound smaller. The limits apply to differences between time
@@ -93,8 +93,8 @@ class LimitedMotion:
 
     values: (n, m), quantities in the nominal motion.
     slopes: (n, m, k), derivatives with respect to the deviations.
-    max_rate, max_acceleration, low, high: (m,), limits of the quantities; infinite if there is
-        none.
+    max_rate, max_acceleration, low, high: (m,), limits of the quantities; infinite if there is no
+        limit.
     """
 
     values: Floats

@@ -36,8 +36,8 @@ class ReferenceForceCurve:
     def __init__(self, curve: dict[str, Any], *, finger_radius_m: float, modulus_pa: float) -> None:
         """Convert a stored dimensionless curve to SI units.
 
-        curve: curve of the file, with two or more depths. modulus_pa: Young's modulus of the
-        object.
+        curve: stored dimensionless curve, with at least two depths. modulus_pa: Young's modulus of
+        the object.
         """
         self._depths_m = finger_radius_m * np.array(curve["depths"])
         forces = modulus_pa * finger_radius_m**2 * np.array(curve["forces"])
@@ -58,7 +58,8 @@ class ReferenceForceCurve:
 def find_reference_curve(
     scene: Scene, along_m: float, around_m: float, file: Path = REFERENCE_FILE
 ) -> ReferenceForceCurve | None:
-    """Return the stored curve for a position on the object of a scene; None if there is none.
+    """Return the stored curve for a position on the object of a scene, or None if no curve is
+    stored.
 
     along_m: position along the axis.
     around_m: arc length from the side that faces the user.

@@ -47,12 +47,12 @@ class Cases:
     """The hands and control loops that are simulated together; each field has shape (n,).
 
     delay_s: time from exposure to the sheet's motion.
-    jitter_s: maximum additional delay of a measurement, uniformly distributed. A measurement that a
-        newer one overtakes is lost.
+    jitter_s: maximum additional delay of a measurement, uniformly distributed. A measurement is
+        lost if a newer measurement overtakes it.
     depth_m: finger depth at equilibrium.
     gain: factor of the sheet's motion around equilibrium.
-    bandwidth_rad_per_s: natural frequency of the filter of the measured depth; infinite without a
-        filter.
+    bandwidth_rad_per_s: natural frequency of the filter of the measured depth; infinite if there is
+        no filter.
     lead_s: time by which the filtered depth is extrapolated.
     """
 
@@ -88,7 +88,7 @@ class Motion:
 
     @property
     def decays(self) -> NDArray[np.bool_]:
-        """Return a mask (n,) that is True for the cases without a sustained oscillation."""
+        """Return a mask (n,) that is True for the cases in which no oscillation is sustained."""
         died_out = self.amplitude_m <= MAX_AMPLITUDE_M
         return np.asarray(died_out | (self.decay_per_s >= SLOWEST_DECAY_PER_S))
 

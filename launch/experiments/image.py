@@ -64,7 +64,7 @@ def push_path(
     """Return a finger path that pushes the side of the cylinder to a depth.
 
     along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
-    front. Raises ExperimentError for a position outside the limits.
+    front. Raises ExperimentError if the position is outside the limits.
     """
     cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:

@@ -11,10 +11,10 @@ is a preference for the second interval. It is added if the second interval has 
 and subtracted otherwise. The Weber fraction w is the increment of 75 % correct answers without
 lapses and bias: ln(1 + w) = 0.674 sigma.
 
-The increment of a trial is the one with the least expected entropy of the posterior of w. This is
-the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown
-lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w falls
-with the square root of the number of trials; `docs/jnd.md` states the measured error.
+For each trial, the increment is selected that gives the least expected entropy of the posterior of
+w. This is the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the
+unknown lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w
+falls with the square root of the number of trials; `docs/jnd.md` states the measured error.
 
 The CSV file is the only state of a session. After an interruption, all stored answers are replayed.
 """
@@ -167,8 +167,8 @@ class PairAnswer:
 
     stiffer: interval that the participant named, 1 or 2.
     response_s: time from the end of the second interval to the answer.
-    depths_m, forces_n: maximum push depth and maximum measured force in each interval; None if not
-        measured.
+    depths_m, forces_n: maximum push depth and maximum measured force in each interval; None if it
+        was not measured.
     """
 
     stiffer: int

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 class NodeCalibrations:
     """The calibrations of stereo camera, sheet and marker that the nodes use.
 
-    The nodes use the values of the scene instead of fields that are None.
+    If a field is None, the nodes use the value of the scene.
 
     stamp_offset_s: time that the camera node adds to timestamps.
     """

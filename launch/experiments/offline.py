@@ -107,8 +107,8 @@ class Evaluation:
 
     fingertip_m: (n, 3), measured minus true fingertip.
     sheet_m: (n, 3), point of the object under the true finger minus the contact point of the sheet.
-    image_m: one map (rows, columns, 2) of image errors per case; NaN where the object is not
-        visible.
+    image_m: one map (rows, columns, 2) of image errors per case; NaN if the object is not visible
+        at a pixel.
     felt_n, expected_n: (k,), force of the true sheet, and force that the planner's model of the
         sheet predicts for the same push.
     """
@@ -562,8 +562,8 @@ class OfflineEvaluator:
     def _parallax(self, eye: Floats) -> Floats:
         """Return the shift (rows, columns, 2), m, of object points on the screen if the eye moves.
 
-        The pixels are those of `_object_points`. The shift is NaN where the scene's eye sees no
-        object.
+        The pixels are the same as in `_object_points`. The shift is NaN if the ray of a pixel
+        misses the object.
         """
         on_screen, points = self._object_points
         to_screen = eye[2] / (eye[2] - points[..., 2:])
@@ -575,7 +575,7 @@ class OfflineEvaluator:
 
         The rays start at the scene's eye position. The first array (rows, columns, 2) contains
         points on the screen plane, m. The second array (rows, columns, 3) contains points on the
-        object, m, and NaN where a ray misses the object.
+        object, m. These values are NaN if the ray misses the object.
         """
         size = round(2.0 * HALF_WINDOW_M / self._metres_per_px)
         rays = eye_rays(

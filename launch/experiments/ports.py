@@ -14,7 +14,7 @@ LOOPBACK = "127.0.0.1"
 def choose_ports(launch_file: Path) -> list[str]:
     """Return launch settings that give the simulated arms and their bridges free TCP ports.
 
-    For a graph without simulated arms, the list is empty.
+    If the graph has no simulated arms, the list is empty.
     """
     graph = load_graph(launch_file)
     simulators = graph.nodes_of_type("twin_arms")

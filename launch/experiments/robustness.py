@@ -192,9 +192,10 @@ def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Summarize the trials by metric.
 
-    A summary contains median, 95 % quantile and maximum of the metric, and the seed of the maximum.
-    It also contains the number of trials with the metric, the number of trials out of tolerance,
-    and how many of these no self-check flagged. Values without trials are None.
+    A summary contains the median, the 95 % quantile and the maximum of the metric, and the seed of
+    the maximum. It also contains the number of trials that have the metric, and the number of
+    trials that are out of tolerance. The key `not_flagged` is the number of trials out of tolerance
+    that no self-check flagged. If no trial has the metric, the statistics are None.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

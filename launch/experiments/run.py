@@ -119,7 +119,7 @@ def run_experiment(
 ) -> None:
     """Run a procedure on the graph of a launch file.
 
-    bag: file to which all topics are recorded; None for no recording.
+    bag: file to which all topics are recorded, or None if nothing is recorded.
     settings, apparatus, needed, without: arguments for `load_graph`.
     """
     plan = load_graph(

@@ -164,7 +164,8 @@ def _make_row(
     evaluation: EvaluationKind,
     effects: Mapping[str, Mapping[str, float | None]] | None,
 ) -> Row:
-    """Return the effects of one deviation of a parameter; metrics without evaluation are None.
+    """Return the effects of one deviation of a parameter. If a metric was not evaluated, its effect
+    is None.
 
     At rest, an effect is the mean change of single vectors, pixels and pushes. In simulated time,
     an effect is the mean error minus the mean error with the nominal apparatus. sigma: deviation in

@@ -69,7 +69,8 @@ MAX_BOUNDARY_SLOPE = 1.5
 
 SLOPES = 32
 FILTERS = ((math.inf, False), (math.inf, True), (10.0, False))
-"""The variants of the depth filter: bandwidth (rad/s), and whether the delay is predicted.
+"""The variants of the depth filter: its bandwidth (rad/s), and whether the depth is predicted over
+the delay.
 
 An infinite bandwidth means that the depth is not filtered.
 """
@@ -145,7 +146,8 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
 def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Floats:
     """Return the smallest slopes (n,) of the offset at which the hands become unstable.
 
-    A slope above 1.5 is returned as NaN. The sheet is linear. All trials must have the same period.
+    If a slope is above 1.5, the result is NaN. The sheet is linear. All trials must have the same
+    period.
     """
     slopes = np.geomspace(0.03, MAX_BOUNDARY_SLOPE, SLOPES)
     motion = simulate_release(

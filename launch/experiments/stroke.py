@@ -197,7 +197,8 @@ class SampledMotion:
 def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
     """Make a motion from samples (time in ns, value); sort them and drop repeated times.
 
-    name: name of the samples in the error text. Raises ExperimentError for fewer than two samples.
+    name: name of the samples in the error text. Raises ExperimentError if there are fewer than two
+    samples.
     """
     if len(samples) < 2:
         raise ExperimentError(
@@ -219,7 +220,8 @@ class StrokeRecording:
     measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
         y axis and z axis of an edge in the world frame.
     delays_s: delays from the centre of an exposure to the events that it caused, by event.
-    drops: number of lost or refused messages, without those that a `latest` reader skipped.
+    drops: number of lost or refused messages. Messages that a `latest` reader skipped are not
+    counted.
     apparatus: origin of the true parameters of the simulated hardware.
     surface, true_surface: shape of the unloaded sheet, by the scene and by the apparatus.
     loads: times (ns) of load reports of the computers, and whether the computer was overloaded.
@@ -486,7 +488,7 @@ def sheet_errors(
     finger, edges: motions of the fingertip and of both clamped edges.
     normal_offset_m: (n,), commanded depth of the sheet below the undeformed surface.
     shape: shape of the scene's object, if already computed.
-    surface: shape of the unloaded sheet; None for a flat sheet.
+    surface: shape of the unloaded sheet; None if the sheet is flat.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.interpolate(times_ns))
@@ -714,8 +716,8 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
 
 
 def compute_busy_fraction(recording: StrokeRecording, seconds: float) -> float | None:
-    """Return the fraction of load reports during a stroke that state an overload; None without
-    reports.
+    """Return the fraction of load reports during a stroke that state an overload, or None if there
+    are no reports.
     """
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
     busy = [one for at_ns, one in recording.loads if begin_ns <= at_ns <= finish_ns]

@@ -58,7 +58,7 @@ def make_variants(
 
     The files of the other variants are written to the folder.
 
-    ablations: whether to include variants without single methods.
+    ablations: whether to include variants in which a single method is switched off.
     radii: whether to include a larger cylinder.
     """
     scene = require_scene(load_graph(launch_file))

@@ -61,7 +61,7 @@ def describe_graph(
 def open_sweep(folder: Path, settings: Mapping[str, Any]) -> None:
     """Create the folder of a sweep, or check that an existing sweep has the same settings.
 
-    Raises ExperimentError for the first setting that differs.
+    Raises ExperimentError if a setting differs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / SETTINGS_FILE

@@ -194,8 +194,8 @@ class ErrorEvaluator:
     def _force(self, methods: Methods) -> dict[str, float] | None:
         """Return the errors (%) of the felt force while the finger rests at several depths.
 
-        The reference is the stored solution of an independent solver. Without a solution for the
-        scene, the reference is the force of the configuration's own soft body.
+        The reference is the stored solution of an independent solver. If there is no stored
+        solution for the scene, the reference is the force of the configuration's own soft body.
         """
         scene, truth = self.scene, apply_apparatus(self.scene, self.apparatus)
         press = compliance.make_presses(scene)[0]

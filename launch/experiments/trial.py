@@ -40,7 +40,7 @@ from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 Row = dict[str, Any]
 
 NICENESS = 10
-"""The niceness of trials without a graph, which gives other programs on the computer priority."""
+"""The niceness of trials that run no graph. It gives other programs on the computer priority."""
 
 
 @contextmanager

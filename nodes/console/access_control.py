@@ -38,7 +38,7 @@ MIN_TOKEN_LENGTH = 16
 COOKIE = "flexsheet-token"
 
 FRAMING_HEADERS = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
-"""The response headers that forbid other pages to show the console in a frame."""
+"""The response headers that prevent other pages from showing the console in a frame."""
 
 FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")
 """The values of the header Sec-Fetch-Dest that indicate a page embedded in another page."""
@@ -223,7 +223,7 @@ class PageConnection(ServerConnection):
     refused = False
 
     def send_data(self) -> None:
-        """Send the buffered data; after a malformed request, send a refusal first."""
+        """Send the buffered data. If a request was malformed, a refusal is sent first."""
         malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
         if malformed and not self.refused and not self.transport.is_closing():
             self.refused = True

@@ -1,4 +1,6 @@
-"""Render the banner of the console page: state of the arms, remedy, and source of the view."""
+"""Render the banner of the console page. It shows the state of the arms, what the user must do, and
+the source of the displayed data.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +43,9 @@ class GraphState:
 
     scene: name of the scene.
     arms: states of the arms by side.
-    estop_reason: reason of the e-stop; None if no e-stop is engaged.
+    estop_reason: reason of the engaged e-stop; None if no e-stop is engaged.
     sheet: newest sheet target, or None.
-    overload: sentence about an overloaded computer, or empty.
+    overload: sentence about an overloaded computer; empty if no computer is overloaded.
     solver_note: note of the soft-body solver if it has no result for the scene yet, otherwise
         empty.
     replay: name of the replayed bag, or None.

@@ -51,7 +51,7 @@ MAX_LABELS = 64
 
 
 class SceneController:
-    """Select and change the scene of the graph as viewers of the page request."""
+    """Select and change the scene of the graph when viewers of the page request it."""
 
     def __init__(
         self,
@@ -75,7 +75,9 @@ class SceneController:
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
-        """Change to another scene of the run; raise SceneChoiceError for an unknown name."""
+        """Change to another scene of the run; raise SceneChoiceError if there is no scene of this
+        name.
+        """
         self.base, self.moved = scenes.load(self._folder, name), False
         self.sliders = Sliders.from_scene(self.base)
         self._send(self.base)
@@ -91,7 +93,7 @@ class SceneController:
     def apply_sliders(self, now_s: float) -> bool:
         """Change the scene if the sliders have stopped moving, and return whether it changed.
 
-        Raises SceneChoiceError for invalid slider positions.
+        Raises SceneChoiceError if the slider positions are invalid.
         """
         if self._due_s is None or now_s < self._due_s:
             return False
@@ -112,7 +114,8 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Compute, in a background thread, what the mouse needs to select points on the object.
+        """Build, in a background thread, the picker with which the mouse selects points on the
+        object.
 
         finger: controller that moves the finger to the selected points. failed: function that
         receives an error text if the object permits no selection.
@@ -276,7 +279,7 @@ class Replay:
     def open(self, name: str) -> None:
         """Open a bag of the folder by its name, and play it from its start.
 
-        Raises BagError for a file that is not a readable bag.
+        Raises BagError if the file is not a readable bag.
         """
         self.timeline = Timeline(self._folder / name)
         self.playing = True
@@ -370,7 +373,7 @@ class ConsoleController:
         self._publish(EStop(engaged=True, reason=reason))
 
     def release(self) -> None:
-        """Reset the e-stop; raise ReleaseError if the nodes ignore resets from this host."""
+        """Reset the e-stop. Raises ReleaseError if the nodes ignore resets from this host."""
         if others := self.facts.others_may_reset:
             raise ReleaseError(
                 f"the host of this console {NodeNote.MAY_NOT_RESET.phrase}; "
@@ -415,7 +418,7 @@ def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> Consol
     """Load the saved state of the previous console process.
 
     warn: function that receives the cause if the saved state is invalid.
-    Without a valid state, the result contains the first scene of the plan.
+    If there is no valid state, the result contains the first scene of the plan.
     """
     try:
         state = load_state(files.state)

@@ -22,7 +22,7 @@ class Ray:
     """A ray in the world frame that selects its first intersection with the object.
 
     direction: vector of any length except 0.
-    Raises ValueError for values that are not finite, and for a direction of length 0.
+    Raises ValueError if a value is not finite, or if the length of the direction is 0.
     """
 
     origin_m: tuple[float, float, float]
@@ -54,7 +54,7 @@ class FingerIntent:
     position: ray that selects a point on any object.
     depth_m: depth below the surface if the finger is not lifted.
     lifted: whether the finger hovers above the point.
-    Raises ValueError for a depth that is negative or not finite.
+    Raises ValueError if the depth is negative or not finite.
     """
 
     position: Ray = field(default_factory=lambda: Ray.from_front(0.0, 0.0))
@@ -118,7 +118,7 @@ class FingerController:
         self._request(position=position, lifted=False)
 
     def move_to(self, x_m: float, y_m: float) -> None:
-        """Move to a position (x, y) as seen from the front, and keep the depth."""
+        """Move to a position (x, y) as seen from the front, without a change of the depth."""
         self._request(position=Ray.from_front(x_m, y_m))
 
     def push(self, depth_m: float) -> None:
@@ -157,7 +157,7 @@ class FingerController:
         """Publish the next step towards the target, and return whether it was the last step.
 
         duration_s: duration of the step. measured: measured position (3,) of the finger, m; None if
-            unknown.
+            the position is unknown.
         """
         if self._target is None or self._picker is None or self._arrived:
             if measured is not None:

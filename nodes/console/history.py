@@ -44,7 +44,9 @@ class History:
         return (times, *values.T)
 
     def latest_and_max(self) -> dict[str, tuple[float, float]]:
-        """Return the latest value and the maximum (ms) of each series; NaN without samples."""
+        """Return the latest value and the maximum (ms) of each series, or NaN if there are no
+        samples.
+        """
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
             valid = values[np.isfinite(values)]

@@ -1,9 +1,9 @@
 """Add the console's title, style sheet and script to the HTML head of viser's page.
 
 viser's page has the title "Viser", sliders without names, folders that cannot be opened by
-keyboard, and labels with too little contrast. It shows only a red dot for a lost connection. This
-module replaces the title. The files page.css and page.js correct the other defects. A page without
-a head element is served unchanged.
+keyboard, and labels with too little contrast. If the connection is lost, it shows only a red dot.
+This module replaces the title. The files page.css and page.js correct the other defects. A page
+without a head element is served unchanged.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ class Operator:
         """Build the page.
 
         name: name of the console's node.
-        with_finger: whether the graph simulates the finger, so that the mouse can move it.
+        with_finger: whether the graph simulates the finger, so that the mouse can move the finger.
         with_eye: whether the graph simulates the eye.
         """
         self._name, self._live, self.controller = name, live, controller

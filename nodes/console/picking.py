@@ -1,4 +1,4 @@
-"""Compute the fingertip position that the mouse selects on the object, and a path to it."""
+"""Compute the fingertip position that the mouse selects on the object, and a path to this point."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIN_STEP_RATIO = 0.01
 """The minimum length of a step around an object, as a fraction of the maximum step length."""
 
 HOVER_M = 0.03
-"""The height of a lifted finger above the object's surface."""
+"""The distance of a lifted finger from the object's surface, in metres."""
 
 RIM_MARGIN_M = 0.002
 """The minimum distance of a selected point from the rim of the touchable surface."""
@@ -118,8 +118,9 @@ class SurfacePicker:
         """Return the next point (3,), in m, on the path of the finger to the target.
 
         finger, target: present and requested position (3,), m. The step is at most `max_step_m`
-        long. The step ends at most `depth_m` below the surface, or at the present depth if that is
-        larger. If a step around the object makes no progress, the step is straight.
+        long. The step ends at most `depth_m` below the surface, or at the present depth if the
+        present depth is larger. If a step around the object makes no progress, the step is
+        straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

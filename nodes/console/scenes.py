@@ -21,7 +21,7 @@ MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """An error that is raised for a scene that cannot be used."""
+    """An error that is raised if a scene cannot be used."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
@@ -40,7 +40,7 @@ def list_scene_names(folder: Path) -> list[str]:
 
 
 def load(folder: Path, name: str) -> Scene:
-    """Load a scene of the run's folder; raise SceneChoiceError for an unknown name."""
+    """Load a scene of the run's folder; raise SceneChoiceError if the name is unknown."""
     names = list_scene_names(folder)
     if name not in names:
         raise SceneChoiceError(f'unknown scene "{name}"; choose one of: {", ".join(names)}')
@@ -54,7 +54,7 @@ def edit_scene(
 
     size_ratio: size relative to the size in `scene`.
     The front of the object stays in place, and the object grows away from the user. A rigid object
-    stays rigid. Raises SceneChoiceError for invalid values.
+    stays rigid. Raises SceneChoiceError if a value is invalid.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -107,7 +107,7 @@ def _with(part: Any, **changes: Any) -> Any:
 def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
     """Scale a shape about its origin; return a plane unchanged.
 
-    Raises SceneChoiceError for a ratio that is not a positive number.
+    Raises SceneChoiceError if the ratio is not a positive number.
     """
     if not (np.isfinite(ratio) and ratio > 0.0):
         raise SceneChoiceError(

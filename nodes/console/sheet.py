@@ -62,11 +62,11 @@ def film(
 ) -> Floats:
     """Compute the deflection (n,) of a film that is clamped at x = +-width / 2.
 
-    x, y: coordinates (n,) of the points, m. finger: position (x, y), m. size_m: width and height.
-    The result is relative to the depth of the finger, and it is 1 within `radius_m` of the finger.
-    The deflection solves Laplace's equation for a point force in an infinite strip. Its Green's
-    function follows from a conformal map. Mirror images of the finger model the free edges at y =
-    +-height / 2.
+    x, y: coordinates (n,) of the points, m. finger: position (x, y), m. size_m: width and height of
+    the film. The result is relative to the depth of the finger, and it is 1 within `radius_m` of
+    the finger. The deflection solves Laplace's equation for a point force in an infinite strip. Its
+    Green's function follows from a conformal map. The free edges at y = +-height / 2 are
+    represented by mirror images of the finger.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger

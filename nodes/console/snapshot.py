@@ -34,7 +34,7 @@ class SceneSnapshot:
     sheet: points (n, 3) of the sheet.
     skin: deformed vertices (s, 3) of the object's surface mesh.
     finger: position (3,) of the fingertip. finger_valid: whether the fingertip is tracked.
-    Lengths are in m; unknown values are None.
+    Lengths are in m. A value is None if it is unknown.
     """
 
     links: dict[str, Floats]
@@ -111,9 +111,9 @@ def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Compute the light rays by which the eye sees points (n, 3), in m, of the deformed surface.
 
     sheet: points of the drawn sheet.
-    Returns segments (m, 2, 3) from the eye to the sheet, and segments (m, 2, 3) from the sheet to
-    the projector. A point whose ray misses the sheet has no segments. The result is empty for a
-    scene without projector.
+    Returns k segments (k, 2, 3) from the eye to the sheet, and k segments (k, 2, 3) from the sheet
+    to the projector. A point whose ray misses the sheet has no segments. The result is empty if the
+    scene has no projector.
     """
     if scene.projector is None:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))

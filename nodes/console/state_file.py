@@ -17,7 +17,7 @@ from flexsheet.nodes.console.scenes import MIN_STRETCH_RATIO, SceneChoiceError
 class Sliders:
     """The positions of the sliders on the console page.
 
-    young_modulus_pa: Young's modulus of the object; None for a rigid object.
+    young_modulus_pa: Young's modulus of the object; None if the object is rigid.
     stretch_ratio: minimum stretch ratio of the sheet.
     size_ratio: size of the object, relative to its size in the scene file.
     """
@@ -56,7 +56,7 @@ class ConsoleState(BaseModel):
 def load_state(path: Path) -> ConsoleState | None:
     """Read the saved state of a console; return None if there is no file.
 
-    Raises SceneChoiceError for an invalid file.
+    Raises SceneChoiceError if the file is invalid.
     """
     try:
         return ConsoleState.model_validate_json(path.read_bytes())

@@ -3,8 +3,8 @@
 The methods are the linear method, the nonlinear table, and Newton's method. The references are full
 Newton solutions of one push on separate, finer meshes. At each push depth, the reference is the
 finest mesh with a converged solution. The difference from the second finest mesh is taken as the
-uncertainty of the reference. Where no solution converged, the chart shows only the time and the
-maximum displacement of the skin (the surface of the body).
+uncertainty of the reference. If no solution converged at a depth, the chart shows only the time and
+the maximum displacement of the skin (the surface of the body).
 """
 
 from __future__ import annotations
@@ -45,9 +45,10 @@ TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
-"""The distances between skin nodes of two kinds of reference meshes, from the most to the least
-accurate mesh. Focused meshes are fine only near the finger, and their spacing is in finger radii.
-Even meshes have the same spacing everywhere, in metres."""
+"""The distances between the skin nodes of two kinds of reference meshes, in order of decreasing
+accuracy. Focused meshes are fine only near the finger, and their spacing is in finger radii. Even
+meshes have the same spacing everywhere, in metres.
+"""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
@@ -64,8 +65,8 @@ MAX_DISPLACEMENT = "largest_move_mm"
 
 
 class SkinSolution(Protocol):
-    """The interface of a method's result for one push: the displacement of the skin nodes (s, 3),
-    m, and the force (3,), N.
+    """The interface of a method's result for one push: the displacement (s, 3), m, of the s skin
+    nodes, and the force (3,), N.
     """
 
     @property
@@ -77,12 +78,12 @@ class SkinSolution(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyBenchmark:
-    """A benchmark of the soft-body methods for pushes at one point of the object of a scene.
+    """A benchmark of the soft-body methods for pushes at one surface point of a scene's object.
 
-    depths_m: push depths. linear_m, table_m: skin spacing (m) for each name of a linear or table
-    method. newton_m: depths at which the time of full Newton solutions is measured. focused: skin
-    spacings of the reference meshes that are fine only near the finger, in finger radii. even_m:
-    skin spacings of the even reference meshes, m.
+    depths_m: push depths. linear_m, table_m: distance between skin nodes (m) by name of the linear
+    or table method. newton_m: depths at which the time of full Newton solutions is measured.
+    focused: skin spacings of the reference meshes that are fine only near the finger, in finger
+    radii. even_m: skin spacings of the even reference meshes, m.
     """
 
     scene: Scene
@@ -95,8 +96,8 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the body with its linear method, and the precomputed model. Compute them if they
-        are not cached.
+        """Return the body with its linear method, and the precomputed model. Both are computed if
+        they are not cached.
 
         spacing_m: distance between skin nodes.
         """
@@ -146,7 +147,7 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return, by method, tables that cover only the skin near the push.
+        """Return tables that cover only the skin near the push, by name of the method.
 
         The result contains the methods whose full table is not cached.
         """
@@ -177,7 +178,7 @@ class SoftBodyBenchmark:
         return ReferenceSet(references, sample, self.scene)
 
     def trials(self) -> Iterator[Trial]:
-        """Yield one trial (measurement of one case) for each method and push depth.
+        """Yield one trial (a measurement of one method) for each method and push depth.
 
         The error of a trial is the maximum displacement error of the skin nodes that the finger
         does not hide, in mm. The force error is an additional metric.
@@ -265,8 +266,8 @@ class ReferenceSet:
         """Return the trial of a method at one push depth.
 
         rest (s, 3): undeformed skin nodes, m. run: function that computes the solution. in_range:
-        whether the depth is in the valid range of the method. The error is NaN if no reference
-        converged at the depth.
+        whether the method is valid at this depth. The error is NaN if no reference converged at the
+        depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
         present = [one for one in self._references if one.reaches(depth_m)]

@@ -36,7 +36,7 @@ FORCE_ERROR_RATIOS = {
     QUICK_TABLE: ((0.18, 0.10, 0.10, 0.10, 0.10, 0.10), (1.13, 0.76, 0.59, 0.46, 0.22, 0.22)),
     "nonlinear_table": ((0.17, 0.07, 0.03, 0.03, 0.03, 0.03), (1.13, 0.76, 0.15, 0.15, 0.15, 0.15)),
 }
-"""The stated relative errors of the force by method, at the depths `ERROR_DEPTHS_M`.
+"""The relative errors of the force that the node states, by method, at the depths `ERROR_DEPTHS_M`.
 
 The first row applies to cylinders on a strip support, for which the forces of a table are
 corrected. The second row applies to other bodies, whose tables use the linear response at small
@@ -45,7 +45,7 @@ spacing of 4.5 mm. The first row was measured by `python -m benchmarks.soft_body
 The second row is derived from the first row and was not measured.
 """
 NOTED_DEPTHS_M = (0.001, 0.005)
-"""The push depths (m) for which the node's status reports the error of the force."""
+"""The push depths (m) for which the node's status message contains the error of the force."""
 
 
 def state_force_error_ratio(method: str, mesh: MeshSpec, depth_m: float) -> float:
@@ -84,10 +84,10 @@ class SceneBody:
     """A soft body of a scene, in its pose in the world.
 
     method: method that computes the response. shape, spec, skin: surface, inputs and skin mesh.
-    front (3,): surface point nearest to the user, m, mesh frame. world_from_mesh (4, 4): pose. rest
-    (s, 3): undeformed skin nodes, m, mesh frame. linear_depth_m: maximum depth of the linear
-    method, at which the stiffness is evaluated. friction_ratio: friction coefficient; 0 means that
-    the finger slides freely.
+    front (3,): surface point nearest to the user, m, mesh frame. world_from_mesh (4, 4): pose of
+    the mesh frame in the world. rest (s, 3): undeformed positions of the s skin nodes, m, mesh
+    frame. linear_depth_m: maximum depth of the linear method, at which the stiffness is evaluated.
+    friction_ratio: friction coefficient; 0 means that the finger slides freely.
     """
 
     method: SoftBodyMethod
@@ -106,7 +106,7 @@ class SceneBody:
         """Return the response to a fingertip at `point_world` (3,), m, and the new contact anchor.
 
         anchor: contact anchor (pushed surface point) that the previous call returned, or None.
-            Raises ValueError for a point that is not finite.
+        Raises ValueError if a coordinate of the point is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:
@@ -183,10 +183,10 @@ def build_scene_body(
 ) -> SceneBody:
     """Build the soft body of a scene from its precomputed model.
 
-    linear_depth_m: maximum depth at which the linear method is valid. max_depth_m: depth that
-    limits the displacement. friction_ratio: friction coefficient between finger and skin. Raises
-    ValueError unless 0 < linear_depth_m < max_depth_m, or if the axis of a cylinder points to the
-    user.
+    linear_depth_m: maximum depth at which the linear method is valid. max_depth_m: push depth at
+    which the displacement stops growing. friction_ratio: friction coefficient between finger and
+    skin. Raises ValueError unless 0 < linear_depth_m < max_depth_m, or if the axis of a cylinder
+    points to the user.
     """
     pose = world_from_mesh(scene)
     shape = make_shape(dict(scene.object.geometry))
@@ -249,7 +249,7 @@ def blend_responses(old: Response, new: Response, weight: float) -> Response:
     """Return the weighted mean of two responses.
 
     weight: weight of the new response, from 0 to 1. Fields that cannot be averaged, and the depths
-    of the force curve, are those of the new response.
+    of the force curve, are taken from the new response.
     """
     depths = new.force_curve[:, 0]
     before = np.interp(depths, old.force_curve[:, 0], old.force_curve[:, 1])

@@ -24,9 +24,10 @@ class ContactQuery:
     """The contact of a fingertip with the undeformed object.
 
     surface (3,), normal (3,): pushed surface point, m, and its outward normal. depth_m: depth of
-    the fingertip below this point along the normal, which is negative outside the object. beyond_m:
-    distance of the fingertip beyond the edge of the surface. drag_m (3,): displacement of the
-    fingertip along the surface since it started to stick to the point; None for a sliding finger.
+    the fingertip below this point along the normal; negative if the fingertip is outside the
+    object. beyond_m: distance of the fingertip beyond the edge of the surface. drag_m (3,):
+    displacement of the fingertip along the surface since it started to stick to the point; None if
+    the finger slides.
     """
 
     surface: Floats
@@ -52,8 +53,8 @@ def locate(
     anchor: anchor that the previous call returned, or None. The contact point is usually the
     nearest surface point. It is the anchor if the fingertip is near the centre of curvature. It is
     also the anchor if the nearest point is on the far side of the body. Therefore a finger that is
-    pushed through a body remains in contact with the side that it entered. Raises ValueError for a
-    point that is not finite.
+    pushed through a body remains in contact with the side that it entered. Raises ValueError if a
+    coordinate of the point is not finite.
     """
     if not np.isfinite(point).all():
         raise ValueError(
@@ -77,7 +78,7 @@ def locate_sticking(
     """Return the contact of a sticking fingertip at `point` (3,), m, and the next anchor.
 
     anchor: first contact point, to which the fingertip sticks, or None before contact. Pass the
-    returned anchor to the next call. Raises ValueError for a point that is not finite.
+    returned anchor to the next call. Raises ValueError if a coordinate of the point is not finite.
     """
     query, new_anchor = locate(shape, point, anchor)
     if new_anchor is None or anchor is None:
@@ -105,7 +106,7 @@ def slide_anchor(
 def _make_query(
     point: Floats, surface_point: Floats, normal: Floats, on_edge: bool
 ) -> ContactQuery:
-    """Return the contact of a fingertip at `point` (3,) with the tangent plane of a surface point
+    """Return the contact of a fingertip at `point` (3,) with the tangent plane at a surface point
     (3,).
     """
     depth = float((surface_point - point) @ normal)

@@ -50,12 +50,12 @@ CURVE_FRACTIONS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
 class SkinResponse:
     """The response of a linear body to unit normal forces on its skin.
 
-    Young's modulus is 1 Pa. rest (s, 3): undeformed positions of the skin nodes, m, mesh frame.
-    contact_nodes (m,): indices into `rest` of the nodes that the finger can touch. normals (m, 3):
-    outward normals at these nodes. faces (f, 6): six-node triangles, as indices into
+    Young's modulus is 1 Pa. rest (s, 3): undeformed positions of the s skin nodes, m, mesh frame.
+    contact_nodes (m,): indices into `rest` of the m nodes that the finger can touch. normals (m,
+    3): outward normals at these nodes. faces (f, 6): six-node triangles, as indices into
     `contact_nodes`. compliance (m, m): inward displacement of node i (m) per inward force on node j
-    (N). The matrix is symmetric. influence (m, 3 s) float32: displacement of the whole skin per
-    inward force on each contact node.
+    (N). The matrix is symmetric. influence (m, 3s), float32: displacement (m) of all skin nodes per
+    inward force (N) on each contact node.
     """
 
     rest: Floats
@@ -70,9 +70,11 @@ class SkinResponse:
 class DragResponse:
     """The response of a linear body to unit tangential forces on its skin.
 
-    Young's modulus is 1 Pa. tangents (m, 2, 3): two directions along the skin at each contact node.
+    Young's modulus is 1 Pa. The body has m contact nodes, which the finger can touch, and s skin
+    nodes. tangents (m, 2, 3): two directions along the skin at each contact node.
     compliance (2m, 2m): displacement along direction i (m) per force along direction j (N).
-    influence (2m, 3 s) float32: displacement of the whole skin per force along each direction.
+    influence (2m, 3s), float32: displacement (m) of all skin nodes per force (N) along each
+    direction.
     """
 
     tangents: Floats
@@ -84,10 +86,10 @@ class DragResponse:
 class Response:
     """The response of a soft body to one finger position, in the mesh frame.
 
-    displacement (s, 3): displacement of the skin nodes, m. force_n (3,): force on the finger.
+    displacement (s, 3): displacement of the s skin nodes, m. force_n (3,): force on the finger.
     stiffness_n_per_m: force divided by depth at the end of the linear range. force_curve (n, 2):
-    depth (m) and force (N). push_depth_m: depth of the push. in_range: whether the method is valid
-    for the push.
+    depth (m) and force (N) of n points. push_depth_m: depth of the push. in_range: whether the
+    method is valid for the push.
     """
 
     displacement: Singles
@@ -101,8 +103,8 @@ class Response:
 class SoftBodyMethod(Protocol):
     """The interface of the methods that compute the response of a soft body to the finger.
 
-    name: name of the method in messages. at_rest (s, 3): displacement of the skin without contact,
-    which is zero.
+    name: name of the method in messages. at_rest (s, 3): displacement of the s skin nodes if the
+    finger does not touch the skin, which is zero.
     """
 
     @property
@@ -134,10 +136,10 @@ class SoftBodyMethod(Protocol):
 class NormalContact:
     """The solution of a frictionless contact between skin and finger.
 
-    nodes (k,): indices of the loaded contact nodes. forces (k,): inward forces on these nodes, N.
-    force_n (3,): total force on the finger. The other fields describe the q contact points under
-    pressure. weights (q, k): shape functions of the nodes. normals (q, 3): skin normals. pressed_n
-    (q,): normal forces.
+    nodes (k,): indices of the k loaded contact nodes. forces (k,): inward forces on these nodes, N.
+    force_n (3,): total force on the finger. The other fields describe the q contact points with a
+    pressure above zero. weights (q, k): shape functions of the nodes. normals (q, 3): skin normals.
+    pressed_n (q,): normal forces.
     """
 
     nodes: Ints
@@ -163,8 +165,8 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
     """Return the depths (m) at which a force curve is sampled.
 
-    The depths are dense up to `linear_m`. Larger depths increase geometrically up to the maximum of
-    `largest_m` and `push_m`.
+    The depths are dense up to `linear_m`. Larger depths increase geometrically up to the larger
+    value of `largest_m` and `push_m`.
     """
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
     deeper = np.geomspace(
@@ -174,10 +176,10 @@ def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Flo
 
 
 def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
-    """Return shape functions (p, 6) and local coordinates (p, 2) of contact points in a triangle.
+    """Return shape functions (p, 6) and local coordinates (p, 2) of p contact points in a triangle.
 
-    The triangle has six nodes and is divided into `divisions` squared equal parts. The contact
-    points are the centroids of the parts.
+    The triangle has six nodes and is divided into `divisions` ** 2 equal parts. The p contact
+    points are the centroids of these parts.
     """
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(divisions) for j in range(divisions - i)]
     inverted = [(i + 2 / 3, j + 2 / 3) for i in range(divisions) for j in range(divisions - i - 1)]
@@ -198,7 +200,7 @@ class SphereContact:
     ) -> None:
         """Sample the contact points of the skin.
 
-        shape: smooth surface that the triangles in `response` approximate, mesh frame.
+        shape: smooth surface, in the mesh frame, that the triangles in `response` approximate.
         """
         self._response = response
         self._radius = finger_radius_m
@@ -224,10 +226,11 @@ class SphereContact:
         """Return the penetration (q,), in m, of skin points into the rigid finger.
 
         The penetration is negative outside the finger. points, normals (q, 3): skin points and
-        their outward normals. centre (3,): centre of the sphere. direction (3,): outward surface
-        normal at the contact. Skin that faces away from this direction has no penetration. Beyond
-        `FLANK_RATIO` of its radius, the sphere is replaced by its tangent cone. Therefore each
-        value is finite and has a continuous slope.
+        their outward normals. centre (3,): centre of the sphere that models the fingertip, m.
+        direction (3,): outward surface normal at the contact. Skin that faces away from this
+        direction has no penetration. At more than `FLANK_RATIO` radii from the push axis, the
+        sphere is replaced by a tangent cone. Therefore each value is finite and has a continuous
+        slope.
         """
         offset = centre - points
         along = np.einsum("qi,qi->q", offset, normals)
@@ -299,8 +302,9 @@ class DragContact:
     def solve(self, contact: NormalContact, drag: Floats) -> tuple[Ints, Floats, Floats]:
         """Return the tangential forces of a sticking finger for a given normal contact.
 
-        drag (3,): displacement of the finger since it started to stick, m. Return row indices (2k,)
-        of `influence`, the forces (2k,), N, of these rows, and the total force (3,) on the finger.
+        drag (3,): displacement of the finger since it started to stick, m. For k loaded nodes,
+        return row indices (2k,) of `influence`, the forces (2k,), N, of these rows, and the total
+        force (3,), N, on the finger.
         """
         nodes, count = contact.nodes, len(contact.nodes)
         rows = (2 * nodes[:, None] + np.arange(2)).ravel()
@@ -321,13 +325,13 @@ class DragContact:
 def solve_penalty_contact(
     weights: Floats, compliance: Floats, penalty: Floats, depths: Floats
 ) -> Floats:
-    """Return the nodal forces (k,), N, that minimise the contact energy.
+    """Return the forces (k,), N, on k nodes that minimise the contact energy.
 
     The energy of the forces f is 1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2. weights W (q,
-    k): shape functions. compliance C (k, k): m/N. penalty d (q,): N/m. depths t (q,): m. Newton's
-    method starts from Hertz's estimate that points deeper than half of the maximum depth are in
-    contact. After `FULL_STEPS` steps, a line search damps the method. Raises ArithmeticError if the
-    method does not converge.
+    k): shape functions of the nodes at q contact points. compliance C (k, k): m/N. penalty d (q,):
+    N/m. depths t (q,): m. Newton's method starts from Hertz's estimate that points deeper than half
+    of the maximum depth are in contact. After `FULL_STEPS` steps, a line search damps the method.
+    Raises ArithmeticError if the method does not converge.
     """
     compliance_at_points = weights @ compliance
     identity = np.eye(len(compliance))
@@ -378,7 +382,7 @@ class LinearSoftBody:
     """The linear soft-body method: a superposition of precomputed responses to unit forces.
 
     Pushes deeper than `linear_depth_m` are reported as out of range. For these pushes, the force is
-    proportional to the depth, and the displacement grows up to the depth `max_depth_m` only.
+    proportional to the depth. The displacement stops growing at the depth `max_depth_m`.
     """
 
     name = "linear"
@@ -399,9 +403,9 @@ class LinearSoftBody:
         """Precompute the force curves of all touchable mesh corners.
 
         bounds (b, 3): positions of skin nodes that must not be touched. Pushes next to these nodes
-        are reported as out of range. push_depth_m: depth at which the force curve ends; None for
-        `max_depth_m`. drag: tangential response for a sticking finger; None for no friction. Raises
-        ValueError unless 0 < linear_depth_m < max_depth_m.
+        are reported as out of range. push_depth_m: depth at which the force curve ends; if it is
+        None, the curve ends at `max_depth_m`. drag: tangential response for a sticking finger, or
+        None if there is no friction. Raises ValueError unless 0 < linear_depth_m < max_depth_m.
         """
         if not 0.0 < linear_depth_m < max_depth_m:
             raise ValueError(
@@ -477,7 +481,7 @@ class LinearSoftBody:
         return result
 
     def _forces(self, point: Floats, normal: Floats) -> Floats:
-        """Return the normal force (n,), N, at the depths of the force curve.
+        """Return the normal force (n,), N, at the n depths of the force curve.
 
         The force never decreases with depth. point, normal (3,): surface point (m) and its outward
         normal.
@@ -497,7 +501,7 @@ class LinearSoftBody:
         return result
 
     def _sum(self, table: Singles, rows: Ints, forces: Floats) -> Singles:
-        """Return the displacement (3 s,), m, of s skin nodes that several nodal forces cause.
+        """Return the displacement (3s,), m, that several nodal forces cause at s skin nodes.
 
         table: influence matrix, m/N. rows, forces (k,): row indices and forces (N).
         """

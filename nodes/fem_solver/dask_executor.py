@@ -68,7 +68,7 @@ class DaskExecutor(Executor):
 def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Executor]:
     """Connect to a dask scheduler, and yield an executor on its workers.
 
-    Running jobs are stopped when the context exits. address: address of the scheduler, such as
+    When the context exits, running jobs are stopped. address: address of the scheduler, such as
     tcp://host:8786. connect_s: timeout. Raises SchedulerError if the scheduler does not answer or
     has no worker, or if a worker has another version of this project.
     """

@@ -15,7 +15,7 @@ from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 MAX_POISSON_RATIO = 0.4999
-"""The maximum Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
+"""The maximum of Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
 MIN_VOLUME_RATIO = 1e-6
 """The minimum ratio of an element's Jacobian determinant to the cube of its edge length. For
 flatter elements, rounding errors make the solution useless."""
@@ -48,7 +48,8 @@ def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float
 
 
 def quadrature() -> tuple[Floats, Floats]:
-    """Return quadrature points (8, 3) and positive weights (8,) on the unit tetrahedron.
+    """Return the 8 quadrature points (8, 3) and their positive weights (8,) on the unit
+    tetrahedron.
 
     The rule is exact for polynomials up to degree 3. Source: conical
     product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
@@ -67,7 +68,9 @@ def quadrature() -> tuple[Floats, Floats]:
 
 
 def shape_gradients(points: Floats) -> Floats:
-    """Return shape function gradients (q, 10, 3) at points (q, 3) of the unit tetrahedron."""
+    """Return the gradients (q, 10, 3) of the shape functions at q points (q, 3) of the unit
+    tetrahedron.
+    """
     barycentric = np.column_stack([1.0 - points.sum(axis=1), points])
     slopes = np.vstack([-np.ones(3), np.eye(3)])
     corner = (4.0 * barycentric - 1.0)[:, :, None] * slopes
@@ -79,7 +82,8 @@ def shape_gradients(points: Floats) -> Floats:
 
 
 def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Floats]:
-    """Return Jacobian matrices (e, q, 3, 3) and their determinants (e, q).
+    """Return the Jacobian matrices (e, q, 3, 3) of e elements at q points, and their determinants
+    (e, q).
 
     The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3), m,
     elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raises
@@ -109,10 +113,10 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
 def element_stiffness(
     nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
 ) -> Floats:
-    """Return the element stiffness matrices (e, 30, 30), N/m.
+    """Return the stiffness matrices (e, 30, 30), N/m, of e elements.
 
-    nodes (n, 3), m, elements (e, 10): mesh. Raises SolidMeshError for inverted or flat elements,
-    and ValueError for an invalid material.
+    nodes (n, 3), m, elements (e, 10): mesh. Raises SolidMeshError if an element is inverted or
+    flat, and ValueError if the material is invalid.
     """
     lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
     points, weights = quadrature()

@@ -47,7 +47,7 @@ class NeoHookeanSolid:
         """Compute the shape function gradients and the volumes of the elements.
 
         nodes (n, 3): positions of the nodes, m. elements (e, 10): node indices. Raises
-        SolidMeshError for inverted elements, and ValueError for an invalid material.
+        SolidMeshError if an element is inverted, and ValueError if the material is invalid.
         """
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
@@ -131,8 +131,8 @@ class NeoHookeanSolid:
     def stiffen(self, matrices: Floats, weight: float) -> None:
         """Add a positive definite stiffness to element matrices (e, 30, 30), in place.
 
-        The added stiffness is that of the Laplacian of the displacement, multiplied by `weight` and
-        the shear modulus. It regularizes a tangent stiffness that is not positive definite.
+        The added stiffness is the stiffness matrix of the vector Laplacian, multiplied by `weight`
+        and the shear modulus. It regularizes a tangent stiffness that is not positive definite.
         """
         blocks = matrices.reshape(-1, 10, 3, 10, 3)
         for axis in range(3):
@@ -141,9 +141,9 @@ class NeoHookeanSolid:
     def min_volume_ratio(self, displacement: Floats) -> float:
         """Return the minimum volume ratio J over all quadrature points and nodes.
 
-        The ratio is 1 without deformation, and at most 0 if an element is inverted. A corner of a
-        quadratic element can invert while J is positive at all quadrature points. displacement (n,
-        3): displacement of the nodes, m.
+        The ratio is 1 if the solid is not deformed, and at most 0 if an element is inverted. A
+        corner of a quadratic element can invert while J is positive at all quadrature points.
+        displacement (n, 3): displacement of the nodes, m.
         """
         local = shape_gradients(NODE_COORDINATES)
         rest, moved = (

@@ -39,8 +39,9 @@ MIN_STEP_FRACTION = 1.0 / 16.0
 halved down to this size."""
 MAX_ITERATIONS = 25
 REGULARIZATIONS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
-"""The successive attempts to make the tangent stiffness positive definite. Each pair contains the
-weight of the contact's geometric stiffness, and the added stiffness in units of the shear modulus.
+"""The settings of the successive attempts to make the tangent stiffness positive definite. Each
+pair contains the weight of the contact's geometric stiffness, and the added stiffness in units of
+the shear modulus.
 """
 TOLERANCE = 1e-8
 """The maximum residual force at convergence, as a fraction of the largest nodal force."""
@@ -58,9 +59,9 @@ class EquilibriumState:
     """An equilibrium of the body in contact with the finger.
 
     displacement (n, 3): displacement of the nodes, m. force_n (3,): force of the body on the
-    finger. centre (3,): centre of the sphere, m. min_volume_ratio: minimum ratio of deformed to
-    undeformed volume. reached: whether the solution for the target position converged. If false,
-    `centre` is the last position that converged.
+    finger. centre (3,): centre of the sphere that models the fingertip, m. min_volume_ratio:
+    minimum ratio of deformed to undeformed volume. reached: whether the solution for the target
+    position converged. If false, `centre` is the last position for which the solution converged.
     """
 
     displacement: Floats
@@ -89,7 +90,7 @@ class FingerObstacle:
             the body, to which the contact stiffness is proportional. radius_m: radius of the
             finger.
         axis (3,): unit vector from the tip of the finger along its shaft, which is a cylinder of
-            the same radius; None for a sphere.
+            the same radius; None if the finger is a sphere.
         """
         self.radius_m, self._axis = radius_m, axis
         self._count, self._faces = len(nodes), faces
@@ -113,9 +114,9 @@ class FingerObstacle:
     def inside(self, positions: Floats, centre: Floats) -> tuple[Ints, Floats, Floats, Floats]:
         """Find the contact points inside the finger.
 
-        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m. Return four arrays for k
-        points: indices (k,), penetrations (k,), m, outward normals of the finger (k, 3), and
-        distances from the centre or the axis of the shaft (k,), m.
+        positions (n, 3): nodes, m. centre (3,): centre of the sphere that models the fingertip, m.
+        Return four arrays for k points: indices (k,), penetrations (k,), m, outward normals of the
+        finger (k, 3), and distances from the centre or the axis of the shaft (k,), m.
         """
         offset = self.points(positions) - centre
         if self._axis is not None:
@@ -128,7 +129,7 @@ class FingerObstacle:
     def energy(self, positions: Floats, centre: Floats) -> float:
         """Return the energy (J) of the penalty pressure.
 
-        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
+        positions (n, 3): nodes, m. centre (3,): centre of the sphere that models the fingertip, m.
         """
         inner, depth, _, _ = self.inside(positions, centre)
         d = self._rounding
@@ -139,7 +140,7 @@ class FingerObstacle:
     def forces(self, positions: Floats, centre: Floats) -> Floats:
         """Return the force (n, 3), N, of each node on the finger: the gradient of the energy.
 
-        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
+        positions (n, 3): nodes, m. centre (3,): centre of the sphere that models the fingertip, m.
         """
         inner, depth, normals, _ = self.inside(positions, centre)
         per_point = np.zeros((len(self._penalty), 3))
@@ -220,10 +221,10 @@ class NeoHookeanBody:
             residual force, relative to the largest nodal force. min_step_fraction: minimum fraction
             of a load step. max_step_ratio: maximum load step, in finger radii. factor_dtype:
             precision of the factors of the tangent stiffness; it affects only the search direction.
-        mirror_axes: axes of planes of symmetry if the mesh is only one side of them. Then the
-            forces are those of this side. finger_axis (3,): direction of the finger's shaft; None
-            for a sphere. Raises SolidMeshError for inverted elements and ValueError for an invalid
-            material.
+        mirror_axes: axes of planes of symmetry if the mesh contains only one side of these planes.
+            Then the forces contain only the contribution of this side. finger_axis (3,): direction
+            of the finger's shaft; None if the finger is a sphere. Raises SolidMeshError if an
+            element is inverted, and ValueError if the material is invalid.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
@@ -256,11 +257,11 @@ class NeoHookeanBody:
     ) -> Iterator[EquilibriumState]:
         """Move the finger to each centre (3,) in a straight line, and yield the equilibria.
 
-        start: displacement (n, 3) and sphere centre (3,) of a known equilibrium. If it is None, the
-        sphere at the first centre must not touch the body. If a step does not converge, the last
-        equilibrium is yielded with `reached` false for all remaining centres. A step with inverted
-        elements or with the sphere inside the body has not converged. Raises ValueError for a
-        centre that is not finite.
+        start: displacement (n, 3) of the nodes and centre (3,) of the spherical fingertip in a
+        known equilibrium, m. If it is None, the sphere at the first centre must not touch the body.
+        If a step does not converge, the last equilibrium is yielded with `reached` false for all
+        remaining centres. A step with inverted elements or with the sphere inside the body has not
+        converged. Raises ValueError if a coordinate of a centre is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
@@ -301,7 +302,7 @@ class NeoHookeanBody:
     def solve_equilibrium(
         self, displacement: Floats, centre: Floats, *, guess: Floats
     ) -> tuple[Floats, Factors | None]:
-        """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
+        """Find the equilibrium for a spherical fingertip at `centre` (3,) by Newton's method.
 
         The iteration starts at `displacement` or `guess` (n, 3), m. The start with less energy is
         used. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
@@ -339,7 +340,9 @@ class NeoHookeanBody:
         )
 
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
-        """Raise NewtonNotConvergedError for inverted elements or a sphere inside the body."""
+        """Raise NewtonNotConvergedError if an element is inverted or the fingertip is inside the
+        body.
+        """
         ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
             raise NewtonNotConvergedError(

@@ -37,7 +37,8 @@ BLEND_S = 5.0
 
 
 class FemSolver(Node):
-    """The node that publishes the undeformed skin of the object and its displacement by the finger.
+    """The node that publishes the undeformed skin of the object and the displacement that the
+    finger causes.
 
     The skin is the surface of the object. The node publishes it once for each scene, and the
     displacement once for each fingertip message.
@@ -251,10 +252,10 @@ async def run_unless_superseded(
 ) -> T:
     """Run a function in a thread, and return its result.
 
-    compute: function that receives a progress callback. progress: this callback, with a stop event
-    as an additional first argument. is_superseded: function that returns whether a newer request
-    has arrived. Raises Interrupted if a newer request arrives. The thread then ends later, and its
-    errors are ignored.
+    compute: function that receives a progress callback. progress: the same callback, but with a
+    stop event as an additional first argument. is_superseded: function that returns whether a newer
+    request has arrived. Raises Interrupted if a newer request arrives. The thread then ends later,
+    and its errors are ignored.
     """
     stop = Event()
     task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))

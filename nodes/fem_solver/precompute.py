@@ -84,8 +84,8 @@ class SoftBodyModel:
     """The precomputed elastic response of a soft body and its skin mesh.
 
     response: response to normal forces. triangles (t, 3): skin triangles with outward normals.
-    bounds (s,): true for skin nodes of the curved surface that the finger must not touch, and false
-    for nodes on end faces. drag: response to tangential forces, or None.
+    bounds (s,): for each skin node, true for nodes of the curved surface that the finger must not
+    touch, and false for nodes on end faces. drag: response to tangential forces, or None.
     """
 
     response: SkinResponse
@@ -161,8 +161,8 @@ def compute(
     each touchable node.
 
     checkpoints: store of finished parts, from which an interrupted computation can continue. Raises
-    UnfitMeshError for an object that cannot be meshed, ValueError for an invalid material or
-    size, and MemoryError if the free memory is insufficient.
+    UnfitMeshError if the object cannot be meshed, ValueError if the material or a size is invalid,
+    and MemoryError if the free memory is insufficient.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
@@ -237,8 +237,8 @@ def _solve_unit_loads(
 
     directions (m, p, 3): unit vectors. get_part: function that loads the stored part with an index,
     or computes and stores it. advance: function that receives the number of newly finished loads.
-    Return the displacements per force, m/N, of the s skin nodes (m p, 3 s), and of the contact
-    nodes along each direction (m p, m p).
+    Return the displacements per force, m/N. The first array (m p, 3s) is for the s skin nodes. The
+    second array (m p, m p) is for the contact nodes along each direction.
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -292,7 +292,8 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""The names in the cache file, by field name, for the fields whose names differ."""
+"""The names of some arrays in the cache file, by field name, if they differ from the field names.
+"""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
@@ -322,8 +323,8 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
     """Load the cached model, or compute and store it.
 
-    Raises UnfitMeshError for an object that cannot be meshed, ValueError for an invalid material
-    or size, and MemoryError if the free memory is insufficient.
+    Raises UnfitMeshError if the object cannot be meshed, ValueError if the material or a size is
+    invalid, and MemoryError if the free memory is insufficient.
     """
     entry = response_cache(spec)
     return cached(entry, cache_dir, lambda: compute(spec, progress, entry.checkpoints(cache_dir)))

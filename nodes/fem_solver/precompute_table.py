@@ -56,7 +56,7 @@ T = TypeVar("T")
 VERSION = 5
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""The numbers of progress steps that a snapshot and a node of the table count."""
+"""The numbers of progress steps for one snapshot and for one node of the table."""
 POLL_S = 0.2
 """The period of progress reports and stop checks while snapshots are solved, in seconds."""
 SNAPSHOT_BYTES = 600_000_000
@@ -158,8 +158,8 @@ def compute_table(
 
     model: linear response of the same body. workers: number of workers of the executor on this
     computer. on_quick: function that receives a coarse table long before the complete table is
-    ready; None to omit the coarse table. Raises MemoryError if this computer has too little memory.
-    Raises LostWorkersError if the executor loses its workers.
+    ready; if it is None, no coarse table is computed. Raises MemoryError if this computer has too
+    little memory. Raises LostWorkersError if the executor loses its workers.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
@@ -260,8 +260,8 @@ def _interpolate_by(
     """Interpolate the snapshots at the nodes of all jobs with an executor, and return the results
     in order.
 
-    on_progress: function that receives the number of finished nodes and of nodes of all jobs. Nodes
-        that are mirror images of others have no job.
+    on_progress: function that receives the number of finished nodes and the total number of nodes.
+        Nodes that are mirror images of others have no job.
     """
     filled: dict[int, FilledNodes] = {}
     total = sum(len(job.samples) for job in jobs)

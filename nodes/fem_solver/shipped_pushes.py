@@ -26,12 +26,16 @@ LEVELS = 32767
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path of the file with the shipped snapshots of a table. The file may not exist."""
+    """Return the path of the file with the shipped snapshots of a table, even if there is no such
+    file.
+    """
     return FOLDER / entry.path(FOLDER).name
 
 
 def load_shipped(path: Path) -> dict[str, Snapshot]:
-    """Return the shipped snapshots of a file by name; empty if the file does not exist."""
+    """Return the shipped snapshots of a file by name. If the file does not exist, the result is
+    empty.
+    """
     content = load_arrays(path)
     if content is None:
         return {}

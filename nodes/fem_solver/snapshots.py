@@ -37,8 +37,9 @@ APART_RATIO, RIM_RATIO = 2.2, 0.9
 in finger radii. They apply to shapes other than cylinders."""
 TOLERANCE, MAX_STEP_RATIO, MIN_STEP_FRACTION = 1e-3, 1.0, 0.25
 """The settings of Newton's method for snapshots: the tolerance, and the maximum and minimum load
-step. They are less strict than those of a reference solution. This changes the force by at most
-0.04 % and halves the computation time."""
+step. They are less strict than the settings for a reference solution. This changes the force by at
+most 0.04 % and halves the computation time.
+"""
 MIN_VOLUME_RATIO = 0.2
 """The volume ratio of the most compressed element below which a push ends. Below this ratio, the
 solution at the next depth would not converge."""
@@ -48,10 +49,11 @@ QUICK_COUNT = 9
 contains its push depths."""
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
-"""The parameters of the fine mesh that corrects the forces. The first is the ratio of the skin
-spacing to that of a snapshot. The second is the radius of the fine region, in finger radii. The
-third is the growth of the element size per distance (m/m). `FINE_DEPTHS_M` contains the push
-depths."""
+"""The parameters of the fine mesh that corrects the forces. The first is the ratio of its skin
+spacing to the skin spacing of a snapshot. The second is the radius of the fine region, in finger
+radii. The third is the growth of the element size per distance (m/m). `FINE_DEPTHS_M` contains the
+push depths.
+"""
 SAME_RATIO = 1e-6
 
 
@@ -73,8 +75,8 @@ class SnapshotJob:
 
     nodes (n, 3), m, elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
     six-node triangles that the finger can touch. depths_m: push depths. mirror_axes: axes of planes
-    of symmetry through the sample point if the mesh is only one side of them, 0 for x = 0 and 1 for
-    y = 0.
+    of symmetry through the sample point if the mesh contains only one side of these planes, 0 for x
+    = 0 and 1 for y = 0.
     """
 
     nodes: Floats
@@ -93,9 +95,9 @@ class Snapshot:
     """The solution of a snapshot job.
 
     rest (s, 3): undeformed skin nodes, m. faces (f, 6): six-node triangles of the skin. depths_m
-    (k,): push depths. moved (k, s, 3): skin displacement (m) at these depths. force_n (k, 3): force
-    on the finger for a Young's modulus of 1 Pa. reached: number of converged depths. Entries at
-    larger depths repeat the last converged solution.
+    (k,): push depths. moved (k, s, 3): displacement (m) of the s skin nodes at these k depths.
+    force_n (k, 3): force on the finger for a Young's modulus of 1 Pa. reached: number of converged
+    depths. Entries at larger depths repeat the last converged solution.
     """
 
     rest: Floats
@@ -110,8 +112,8 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
     """Compute the snapshot that a job describes.
 
     stopped: function that returns true to cancel the solution. Raises SnapshotCancelledError if the
-    solution is cancelled, SolidMeshError for inverted elements, and ValueError for an invalid
-    material.
+    solution is cancelled, SolidMeshError if an element is inverted, and ValueError if the material
+    is invalid.
     """
     from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # scipy is slow to import
 
@@ -327,7 +329,8 @@ def _spacing_m(spec: MeshSpec, finger_radius_m: float) -> float:
 def _make_focused_mesh(
     spec: MeshSpec, sample: SamplePoint, spacing_m: float, near_m: float, growth: float | None
 ) -> SolidMesh | None:
-    """Return a mesh that is fine near a sample point, or None for a shape without such meshes.
+    """Return a mesh that is fine near a sample point, or None if the shape does not support such
+    meshes.
 
     spacing_m: skin spacing near the point. near_m: distance within which the mesh has this spacing.
     growth: increase of the element size per distance (m/m); None for the default.
@@ -372,7 +375,7 @@ def make_job_on_mesh(
 ) -> SnapshotJob:
     """Return the job for pushes at a sample point to several depths with a given mesh.
 
-    mirror_axes: axes of planes of symmetry if the mesh is only one side of them.
+    mirror_axes: axes of planes of symmetry if the mesh contains only one side of these planes.
     """
     return SnapshotJob(
         nodes=mesh.nodes,

@@ -72,8 +72,8 @@ class SoftBodyFactory:
     ) -> list[body.SceneBody]:
         """Build the soft body of a scene for each available method, starting with the best method.
 
-        Raises UnfitMeshError for an object that cannot be meshed, ValueError for an invalid
-        material, size or depth, and MemoryError if the free memory is insufficient.
+        Raises UnfitMeshError if the object cannot be meshed, ValueError if the material, a size or
+        a depth is invalid, and MemoryError if the free memory is insufficient.
         """
         spec = body.make_soft_body_spec(
             scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0
@@ -107,8 +107,8 @@ class SoftBodyFactory:
     def _load_model(
         self, spec: precompute.SoftBodySpec, progress: precompute.Progress
     ) -> precompute.SoftBodyModel:
-        """Return the model of a specification. Use the last model if its inputs are equal;
-        otherwise, load or compute the model.
+        """Return the model of a specification. The last model is reused if its inputs are equal.
+        Otherwise, the model is loaded or computed.
         """
         # Read `_model` only once: another thread whose result is no longer needed may replace it.
         last, key = self._model, spec.key()
@@ -144,8 +144,8 @@ class SoftBodyFactory:
         """Compute and cache the nonlinear table, and return the body that uses it.
 
         linear: body with the linear method. on_quick: function that receives a body with a coarse
-        table of few snapshots; None to omit the coarse table. Raises WorkersError if the workers
-        cannot be used or are lost, and MemoryError if the free memory is insufficient.
+        table of few snapshots; if it is None, no coarse table is computed. Raises WorkersError if
+        the workers cannot be used or are lost, and MemoryError if the free memory is insufficient.
         """
         model = self._load_model(linear.spec, progress)
 

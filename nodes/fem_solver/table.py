@@ -59,9 +59,9 @@ FILLED_NODES = 48
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The responses to pushes at m contact nodes to L depths, for a Young's modulus of 1 Pa.
+    """The responses to pushes at m contact nodes and to L depths, for a Young's modulus of 1 Pa.
 
-    depths_m (L,): push depths, of which the first is 0. fields (m, L - 1, 3 s) float32:
+    depths_m (L,): push depths, of which the first is 0. fields (m, L - 1, 3s), float32:
     displacement (m) of the s skin nodes at all depths except 0. force_n (m, L, 3): force on the
     finger. reach_m (m,): maximum depth with a valid solution at each contact node.
     """
@@ -140,9 +140,10 @@ def fill_table(
     """Compute the nonlinear table of a body from snapshots.
 
     triangles (t, 3): triangles of the skin. linear: linear method for the same response and a
-    modulus of 1 Pa. Its linear range must contain the depths `BLEND_M`. fine: push on a fine mesh
-    with which all forces are corrected, or None. interpolate: function that interpolates the
-    snapshots at the nodes of jobs, and returns the results in the order of the jobs.
+    modulus of 1 Pa. Its linear range must contain the depths `BLEND_M`. fine: sample point and
+    snapshot of a push on a fine mesh, with which all forces are corrected; None if the forces are
+    not corrected. interpolate: function that interpolates the snapshots at the nodes of jobs, and
+    returns the results in the order of the jobs.
     """
     interpolator = source.make_interpolator()
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
@@ -277,8 +278,8 @@ def _blend_levels(
 class CubicInterpolator:
     """An interpolator over increasing depths by cubic polynomials with a continuous slope.
 
-    The slope at a depth of the table is that of the parabola through the values at this depth and
-    the two adjacent depths.
+    At each depth of the table, the slope equals the slope of the parabola through the values at
+    this depth and the two adjacent depths.
     """
 
     def __init__(self, depths_m: Floats) -> None:

@@ -39,7 +39,9 @@ sheet's left and right edges, and the fingertip (3,), m, or None."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 FLOOR, TWO_PASS_TRIANGLES = "floor", "two_pass_triangles"
-"""The lower bound of the time, and the method two_pass with four triangles as the sheet."""
+"""The names of two benchmark methods: the lower bound of the time, and the method two_pass for a
+sheet of four triangles.
+"""
 CORRECTION_OF: dict[str, Correction] = {
     FLOOR: "none",
     **{correction: correction for correction in CORRECTIONS},
@@ -61,8 +63,9 @@ SPACING_M = 0.0025
 def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
     """Return the benchmark of all image correction methods for tilted and pushed sheets.
 
-    The cases are those of figures 11 and 13 in Furukawa et al. 2007, and the limits of the scene's
-    working range. solved: whether to include methods that need precomputed deflection shapes.
+    The cases are the cases of figures 11 and 13 in Furukawa et al. 2007, and the limits of the
+    scene's working range. solved: whether to include methods that need precomputed deflection
+    shapes.
     """
     return Family(
         name="correction",
@@ -77,9 +80,9 @@ def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Fa
 def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     """Return whether a correction method is specified for a tilt (degrees) and push depth (mm).
 
-    The method `none` requires a sheet without tilt and push. `one_plane` requires a sheet without a
-    push. `four_triangles` requires a push depth of at most `MAX_TRIANGLES_DEPTH_M`. All methods
-    except `none` are specified for tilts of up to 50 degrees.
+    The method `none` requires a sheet that is neither tilted nor pushed. `one_plane` requires a
+    sheet that is not pushed. `four_triangles` requires a push depth of at most
+    `MAX_TRIANGLES_DEPTH_M`. All methods except `none` are specified for tilts of up to 50 degrees.
     """
     max_triangles_mm = 1e3 * MAX_TRIANGLES_DEPTH_M
     if method == "none":

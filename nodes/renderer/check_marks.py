@@ -21,8 +21,9 @@ from flexsheet.nodes.models.shapes.triangles import intersect_rays
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 SIDE_M = 0.0053
-"""The side length of a projected mark. Its area equals that of a round marker with a radius of 3
-mm."""
+"""The side length of a projected mark. Its area equals the area of a round marker with a radius of
+3 mm.
+"""
 
 FINGER_STEP_M = 0.001
 """The displacement of the fingertip for which the displacements of the marks are computed."""
@@ -32,9 +33,10 @@ FINGER_STEP_M = 0.001
 class CheckMarks:
     """The projected marks of one frame.
 
-    side_px: side of the squares. corners_px (n, 2): left column and top row. world_m (n, 3):
-    centres on the sheet; NaN for a mark that misses the sheet. finger_ratio (n,): displacement of
-    the sheet along its normal, divided by the displacement of the fingertip.
+    side_px: side of the squares. corners_px (n, 2): left column and top row of each of the n marks.
+    world_m (n, 3): centres of the marks on the sheet; NaN if a mark misses the sheet. finger_ratio
+    (n,): displacement of the sheet along its normal at each mark, divided by the displacement of
+    the fingertip.
     """
 
     side_px: int

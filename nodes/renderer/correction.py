@@ -13,8 +13,8 @@ corners. All points are in the world frame, in m. A point is invalid and is not 
     `GRAZING_SINE`.
 - The point is not in front of the eye, or its point C is behind the eye or the projector.
 
-The plane of the sheet is used instead of triangles without area. It is used instead of all four
-triangles if the push is too shallow.
+The plane of the sheet replaces each triangle whose area is zero. It replaces all four triangles if
+the push is too shallow.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ class ProjectionScreen:
     """The actual screen: four triangles with a common vertex, or one plane.
 
     point (3,): common vertex, m (r_s in Furukawa et al. 2007). normals (4, 3): unit normals towards
-    the user (n_si in the paper). They are equal for a plane. corners (4, 3): corners, m,
-    counter-clockwise as seen by the user; None for a plane. Triangle i is between corner i and the
-    next corner.
+    the user (n_si in the paper). For a plane, the normals are equal. corners (4, 3): corners, m,
+    counter-clockwise as seen by the user; None if the screen is one plane. Triangle i is between
+    corner i and the next corner.
     """
 
     point: Floats
@@ -73,8 +73,8 @@ def make_pushed_screen(
     """Return the screen of four triangles between the pushed point and the sheet's corners.
 
     pushed_point (3,), m. corners (4, 3): left bottom, right bottom, right top, left top, m. plane:
-    plane of the sheet without a push. It replaces triangles without area, and all triangles if the
-    push is below `MIN_PUSH_M`. Source: section III-C 3 of Furukawa et al. 2007.
+    plane of the sheet without a push. It replaces each triangle whose area is zero, and all
+    triangles if the push is below `MIN_PUSH_M`. Source: section III-C 3 of Furukawa et al. 2007.
     """
     if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
         return make_flat_screen(plane)
@@ -91,7 +91,7 @@ def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
 
     As seen from the eye, the lines from the pushed point to the corners divide the image into one
     sector for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
-    The normals are zero for a screen of one plane. A single normal is zero if its line points to
+    If the screen is one plane, the normals are zero. A single normal is zero if its line points to
     the eye. eye (3,): position of the eye, m.
     """
     if screen.corners is None:

@@ -134,7 +134,7 @@ def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> I
 def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
     """Return the deflection shapes of a scene from the cache, or None if the cache lacks some.
 
-    cache_dir: folder of the cache; None for the cache of the user.
+    cache_dir: folder of the cache; None selects the cache of the user.
     """
     parts = []
     for weight, stored in list_stored(scene):
@@ -150,7 +150,8 @@ def load_or_compute(
 ) -> IndentationBasis:
     """Load the scene's deflection shapes from the cache, or compute and store them.
 
-    The computation uses all cores. cache_dir: folder of the cache; None for the cache of the user.
+    The computation uses all cores. cache_dir: folder of the cache; None selects the cache of the
+    user.
     progress: function that receives the number of solved pushes and the total number.
     """
     return _combine(

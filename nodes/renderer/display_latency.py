@@ -18,15 +18,15 @@ ON_TIME_FRACTION = 0.85
 class DisplayLatencyEstimator:
     """An estimator of the display time of a frame.
 
-    The display time is the middle of the interval in which the frame is projected. All times are ns
-    of one clock. With a window, the display time is the time of the swap (exchange of the window's
-    buffers) plus a constant latency. Without a window, it is the end of drawing plus this latency.
-    If swaps wait for the projector's refresh, the prediction is based on the next swap for which
-    the frame will be ready.
+    The display time is the middle of the interval in which the frame is projected. All times are in
+    ns and are read from one clock. If there is a window, the display time is the time of the swap
+    (exchange of the window's buffers) plus a constant latency. If there is no window, the display
+    time is the end of drawing plus this latency. If swaps wait for the projector's refresh, the
+    prediction is based on the next swap for which the frame will be ready.
     """
 
     def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:
-        """Create an estimator without recorded frames.
+        """Create an estimator that contains no recorded frames.
 
         first_s: time from the start of drawing to the display time, used for the first frame.
         display_latency_s: time from the swap, or the end of drawing, to the display time. period_s:
@@ -52,7 +52,8 @@ class DisplayLatencyEstimator:
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
     def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
-        """Record the drawing time of a frame without a window, and return its display time (ns).
+        """Record the drawing time of a frame that no window shows, and return the display time
+        (ns).
 
         begun_ns, drawn_ns: start and end of drawing.
         """

@@ -43,8 +43,8 @@ class EyePredictor:
         self._clock: tuple[str, int] | None = None
 
     def add(self, eye: Eye, header: Header) -> None:
-        """Add a message with eye positions. After an invalid message, a gap or a change of clock,
-        delete earlier positions.
+        """Add a message with eye positions. If the message is invalid, or follows a gap or a change
+        of clock, earlier positions are deleted.
         """
         clock, at_ns = (header.clock_id, header.epoch), header.source_ns
         known = self._positions
@@ -63,8 +63,8 @@ class EyePredictor:
     def predict(self, tracked: Input[Eye], horizon_s: float) -> Eye | None:
         """Return the eyes as predicted for a time `horizon_s` after the current time.
 
-        Return None if there is no message or it is too old. An invalid message is returned
-        unchanged.
+        Return None if there is no message, or if the message is too old. An invalid message is
+        returned unchanged.
         """
         eye, age_s = tracked.message, tracked.age_s()
         if eye is None or age_s > self._max_age.seconds:

@@ -166,8 +166,8 @@ class FrameRenderer:
         return frame, source_ns
 
     def _place_check_marks(self, sheet: SheetPose, now_ns: int) -> CheckMarks:
-        """Compute the projected check marks if `CHECK_MARKS_PERIOD_NS` has elapsed; otherwise
-        return no marks.
+        """Return the projected check marks if `CHECK_MARKS_PERIOD_NS` has elapsed; otherwise return
+        no marks.
         """
         projector = self.scene_renderer.scene.projector
         if projector is None or not projector.check_marks_sheet_m:
@@ -195,9 +195,9 @@ class FrameRenderer:
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the drawn object as predicted for the display time `light_ns`.
 
-        Without a recent response of the soft-body solver, use its last response unchanged. Return
-        two times (ns): the exposure time of the data, and the time for which the deformation was
-        predicted.
+        If the soft-body solver has not sent a recent response, its last response is used unchanged.
+        Return two times (ns): the exposure time of the data, and the time for which the deformation
+        was predicted.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds

@@ -51,9 +51,9 @@ class EyeView:
     """The geometry of the image for one eye.
 
     eye, projector: positions (3,), world frame, m. screen: shape of the sheet for which the image
-    is corrected; None for no correction. clip_from_screen: matrix (3, 3) from the imaginary screen,
-    the plane z = 0, to OpenGL clip coordinates. lens: lens of the projector; None for no
-    distortion. grey: whether to draw without colour.
+    is corrected, or None if the image is not corrected. clip_from_screen: matrix (3, 3) from the
+    imaginary screen, the plane z = 0, to OpenGL clip coordinates. lens: lens of the projector, or
+    None if the lens has no distortion. grey: whether to draw without colour.
     """
 
     eye: Floats
@@ -149,7 +149,7 @@ class Canvas:
         """Allocate the framebuffers and buffers.
 
         size: width and height of the image, px. samples: number of samples per pixel
-        (multisampling), which the maximum of the driver limits.
+        (multisampling), limited to the maximum of the driver.
         """
         self.width_px, self.height_px = size
         self.context = context
@@ -251,8 +251,8 @@ class Canvas:
     def shifted_points(self, view: EyeView) -> Floats:
         """Return the vertex positions after the image correction, as the shader computes them.
 
-        The result (n, 4) contains positions (m) and validity (0 or 1). Tests compare the result
-        with a reference.
+        The result (n, 4) contains the position (m) and the validity (0 or 1) of each of the n
+        vertices. Tests compare the result with a reference.
         """
         text = shader_text("object.vert.glsl", CORRECTED=view.screen is not None, LENS=False)
         program = self.context.program(vertex_shader=text, varyings=("shifted",))
@@ -395,9 +395,10 @@ def shader_text(name: str, **macros: int) -> str:
 def limit_driver_threads() -> None:
     """Limit the threads of a software OpenGL driver to half of the cores.
 
-    On two cores, the driver uses no threads. The other half of the cores remains free for other
-    nodes. Without the limit, waiting for driver threads on busy cores uses 50 % more processor
-    time. A value of the environment variable LP_NUM_THREADS takes precedence.
+    The other half remains free for other nodes. If there are at most two cores, the driver starts
+    no threads of its own. Without the limit, rendering on busy cores uses 50 % more processor time,
+    because threads wait for one another. If the environment variable LP_NUM_THREADS is set, its
+    value is used instead.
     """
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))

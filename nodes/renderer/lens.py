@@ -30,8 +30,8 @@ class ClipLens:
 def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
     """Convert a lens to OpenGL clip coordinates.
 
-    Return None for a lens without distortion. Raises ValueError for a distortion that is not
-    invertible within the image.
+    Return None if the lens has no distortion. Raises ValueError if the distortion is not invertible
+    within the image.
     """
     if not any(lens.distortion):
         return None

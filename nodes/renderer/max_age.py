@@ -18,11 +18,13 @@ class MaxAge:
     """The maximum age at which messages about poses, fingertips, eyes and soft bodies are used.
 
     seconds: current maximum age, which is a fixed value or `PERIODS` measured periods of the
-    camera. The second value is limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
+    camera. The measured value is limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
     """
 
     def __init__(self, given_s: float | None = None) -> None:
-        """Set a fixed maximum age, or None to derive the maximum age from the camera's period."""
+        """Set a fixed maximum age (s). If it is None, the maximum age is derived from the camera's
+        period.
+        """
         self.seconds = MIN_AGE_S if given_s is None else given_s
         self._is_given = given_s is not None
         self._last: Header | None = None

@@ -36,8 +36,8 @@ class Renderer(Node):
     """Draw a frame for each soft-body message, at most at `rate_hz`.
 
     If there are no recent soft-body messages, fingertip messages trigger frames. If there are no
-    recent messages of both types, a timer triggers frames. The node publishes a frame after it was
-    drawn or, with a window, after it was shown.
+    recent messages of either type, a timer triggers frames. If there is a window, the node
+    publishes a frame after the window has shown the frame; otherwise, after it is drawn.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER

@@ -77,7 +77,7 @@ def make_surface(
 
     shape: shape of the geometry, which provides true points and normals. world_from_object (4, 4):
     pose. A plane is drawn as a rectangle, and a mesh as the smooth surface that its shape defines.
-    Raises ValueError for a spacing that needs too many triangles.
+    Raises ValueError if the spacing requires too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -219,9 +219,9 @@ class DeformationTransfer:
     """An operator that transfers the displacement of the soft-body solver's skin to a drawn
     surface.
 
-    A drawn vertex moves with the nearest point of the skin. The change of the vertex's normal
-    equals that of the skin's normal at this point. Values on the skin are interpolated between its
-    vertices.
+    A drawn vertex moves with the nearest point of the skin. The normal of the vertex changes as
+    much as the normal of the skin at this point. Values on the skin are interpolated between the
+    vertices of the skin.
     """
 
     def __init__(
@@ -245,7 +245,7 @@ class DeformationTransfer:
         """Return positions (m) and normals, (n, 6), of the deformed drawn surface.
 
         displacement (s, 3): displacement of the skin's vertices, m. The length of the normals is
-        arbitrary. Raises ValueError for a wrong shape of the array, or for values that are not
+        arbitrary. Raises ValueError if the shape of the array is wrong, or if a value is not
         finite.
         """
         if displacement.shape != self._skin.shape:
@@ -269,7 +269,8 @@ class DeformationTransfer:
 def transfer_matrix(
     points: Floats, skin_vertices: Floats, skin_triangles: Indices
 ) -> scipy.sparse.csr_array:
-    """Return the matrix (n, s), float32, that interpolates skin values at points (n, 3).
+    """Return the matrix (n, s), float32, that interpolates values at s skin vertices at n points
+    (n, 3).
 
     Each row contains the barycentric weights of the nearest point of the skin. skin_vertices (s,
     3), skin_triangles (t, 3): skin. Triangles without area are ignored. Raises ValueError if all

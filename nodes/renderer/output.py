@@ -23,8 +23,8 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
     and a note.
 
     eyes: eye positions of the scene, which are used if no eyes are tracked. tracked: newest message
-    of the topic eye; None if there is no message or it is too old. The note is the reason why
-    `tracked` is not used, or empty.
+    of the topic eye; None if there is no message, or if the message is too old. The note is the
+    reason why `tracked` is not used. It is empty if `tracked` is used.
     """
     across = np.array([1.0, 0.0, 0.0])
     if tracked is None:
@@ -51,7 +51,7 @@ def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Flo
     """Return the world positions (2, 3), in m, of the left and the right eye.
 
     The positions are equal in mono mode. across: unit vector (3,) from the left to the right eye;
-    None for the x axis.
+    None selects the x axis.
     """
     direction = np.array([1.0, 0.0, 0.0]) if across is None else across
     half = 0.0 if mode == "mono" else 0.5 * eyes.interocular_m
@@ -64,8 +64,8 @@ def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
     """Return the eye or eyes for which a frame is drawn.
 
     number: number of the frame. shows_both: whether the output itself alternates between the eyes.
-    Then each frame needs both images. Otherwise, odd frames are for the left eye in the mode
-    frame_sequential, and even frames for the right eye.
+    In this case, each frame needs both images. Otherwise, odd frames are for the left eye in the
+    mode frame_sequential, and even frames for the right eye.
     """
     if mode != "frame_sequential" or shows_both:
         return "both"
@@ -78,8 +78,8 @@ def select_drawn_eyes(
     """Return the eye positions (1 or 2, 3) for which a frame is drawn.
 
     pair (2, 3): positions of the left and right eye. which: eye or eyes to which the projector
-    shows the frame. swap_eyes: whether the shutter glasses open in the opposite order. Then a frame
-    for one eye is drawn for the other eye. A frame for both eyes ignores `swap_eyes`.
+    shows the frame. swap_eyes: whether the shutter glasses open in the opposite order. In this
+    case, a frame for one eye is drawn for the other eye. A frame for both eyes ignores `swap_eyes`.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)

@@ -80,7 +80,7 @@ def open_output(
 
     now_ns: function that returns the current time. shown: function that receives the tag and the
     swap time, ns, of each shown image. Raises WindowError if the window cannot be opened, and
-    NoOpenGLError without OpenGL 3.3.
+    NoOpenGLError if OpenGL 3.3 is not available.
     """
     if parameters.output == "headless":
         return OffscreenOutput()
@@ -108,11 +108,11 @@ class ProjectorWindow:
     ) -> None:
         """Create the drawing context.
 
-        monitor: name or number; None for an ordinary window, for tests. swap_interval: number of
-        monitor refreshes per shown image. With 0, swaps do not wait for the refresh, and images may
-        tear. now_ns: function that returns the current time. shown: function that receives the tag
-        and the swap time, ns, of each shown image. Raises WindowError if there is no display or no
-        such monitor.
+        monitor: name or number of the monitor; None selects an ordinary window, for tests.
+        swap_interval: number of monitor refreshes per shown image. If it is 0, swaps do not wait
+        for the refresh, and images can tear. now_ns: function that returns the current time. shown:
+        function that receives the tag and the swap time, ns, of each shown image. Raises
+        WindowError if there is no display or no such monitor.
         """
         limit_driver_threads()
         start_glfw()

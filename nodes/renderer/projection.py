@@ -57,8 +57,8 @@ class ScreenRectangle:
 class EyePicture:
     """The framebuffers for the image of an eye in the first pass.
 
-    samples: framebuffer for drawing. resolved: framebuffer with the averaged image. Without
-    multisampling, it is the same framebuffer. image: texture of `resolved`.
+    samples: framebuffer for drawing. resolved: framebuffer with the averaged image. If
+    multisampling is off, both are the same framebuffer. image: texture of `resolved`.
     """
 
     samples: moderngl.Framebuffer
@@ -86,8 +86,8 @@ class TwoPassProjector:
     def __init__(self, context: moderngl.Context, *, samples: int = SAMPLES) -> None:
         """Prepare the shaders.
 
-        samples: samples per pixel of the first pass, which the maximum of the driver limits; 0 for
-        no multisampling.
+        samples: samples per pixel of the first pass, limited to the maximum of the driver; 0
+        switches multisampling off.
         """
         self._context, self._samples = context, min(samples, context.max_samples)
         self._pictures: dict[tuple[int, int], EyePicture] = {}

@@ -58,9 +58,11 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 )
 
 OVERSAMPLING, UNSAMPLED_OVERSAMPLING = 1.5, 2.5
-"""The ratios of the resolution of the eye's image (first pass of two_pass) to that of the
-projector, with and without multisampling. On a software driver, the variant without multisampling
-needs a quarter less time for equally smooth edges."""
+"""The resolution of the eye's image (first pass of two_pass), divided by the resolution of the
+projector. The first value is used with multisampling, and the second value without multisampling.
+On a software driver, the variant without multisampling needs a quarter less time for equally smooth
+edges.
+"""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
 """The margin (m) around the object in the eye's image, and the step (m) to which the edges of the
@@ -68,7 +70,8 @@ image are rounded. Rounding prevents flicker of the outline when the object move
 MAX_WINDOW_M = 0.3
 """The maximum distance of the edges of the drawn rectangle from the centre of the screen."""
 MIN_REPORTED_FRACTION = 0.005
-"""The minimum fraction of the sheet without light (due to folds) that a note reports."""
+"""The minimum fraction of the sheet that must be dark, because of folds, before a note reports it.
+"""
 NO_SHAPES_NOTE = (
     "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles; "
     "run flexsheet precompute"
@@ -81,7 +84,7 @@ def projector_homography(scene: Scene) -> Floats:
     """Return the homography (3, 3) from the plane z = 0 of the world frame to projector pixels.
 
     Points of the plane, the imaginary screen of Furukawa et al. 2007, are (x, y) in m. The pixels
-    are those of a projector without lens distortion.
+    belong to a projector whose lens has no distortion.
     """
     projector = require_projector(scene)
     return pixel_from_screen(projector.lens, pose_matrix(projector.world_from_projector))
@@ -102,9 +105,11 @@ class SceneRenderer:
     ) -> None:
         """Create the graphics objects of the scene.
 
-        spacing_m: distance between the vertices of the object. samples: samples per pixel; None for
-        `SAMPLES`, without multisampling in the first pass of two_pass with a software driver.
-        basis: deflection shapes of the sheet; None to draw a pushed sheet as four triangles.
+        spacing_m: distance between the vertices of the object. samples: samples per pixel; None
+        selects `SAMPLES`, but no multisampling in the first pass of two_pass if the OpenGL driver
+        is a software driver.
+        basis: deflection shapes of the sheet; if it is None, a pushed sheet is drawn as four
+        triangles.
         sheet_shape: method that computes the shape of the sheet. Raises ValueError if the
         projector's lens maps several rays to one pixel.
         """
@@ -163,7 +168,7 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Set the surface mesh whose displacement by the soft-body solver deforms the object."""
+        """Set the solver's surface mesh, whose displacement deforms the drawn object."""
         vertices = skin.vertices_world_m.astype(np.float64)
         self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
@@ -171,8 +176,9 @@ class SceneRenderer:
     def deform(self, body: SoftBody | None) -> None:
         """Deform the drawn surface by the displacements from the soft-body solver.
 
-        body: message of the solver; None to draw the surface at rest. Raises ValueError, without a
-        change of the surface, if the displacement does not fit the current skin or is not finite.
+        body: message of the solver; if it is None, the surface is drawn at rest. Raises ValueError
+        and leaves the surface unchanged if the displacement does not fit the current skin or is not
+        finite.
         """
         if body is self._drawn_body:
             return
@@ -251,10 +257,10 @@ class SceneRenderer:
     ) -> Image | None:
         """Draw the projector's image, and return it (height, width, 3) if `read` is true.
 
-        eyes (1 or 2, 3): positions, world frame, m; None for the eyes of the scene. Two eyes share
-        the image, except in the mode frame_sequential. This mode has two images. The image of the
-        left eye is returned. drawn: function that receives the index of each image when the image
-        is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
+        eyes (1 or 2, 3): positions of the eyes, world frame, m; None selects the eyes of the scene.
+        Two eyes share the image, except in the mode frame_sequential. This mode has two images. The
+        image of the left eye is returned. drawn: function that receives the index of each image
+        when the image is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")
@@ -309,7 +315,7 @@ class SceneRenderer:
     ) -> Image | None:
         """Draw the projector's image by the method two_pass with a given mesh of the sheet.
 
-        The arguments and the result are those of `draw`.
+        The arguments and the result are the same as for `draw`.
         """
 
         whole = self.canvas.width_px, self.canvas.height_px
@@ -387,8 +393,8 @@ class SceneRenderer:
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a warning if the push is too deep for a sheet of four triangles, otherwise an
-        empty text.
+        """Return a warning if the push is too deep for a sheet of four triangles; otherwise return
+        an empty text.
         """
         if sheet.pushed_point is None:
             return ""

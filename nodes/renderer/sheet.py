@@ -63,7 +63,7 @@ def estimate_sheet(
 
     finger_tip (3,): predicted fingertip, world frame, m, or None. The fingertip pushes the sheet if
     it is below the plane and within the outline of the sheet. twist_world (6,): linear (m/s) and
-    angular (rad/s) velocity of the sheet; None for a sheet at rest. ahead_s: time from the
+    angular (rad/s) velocity of the sheet; None if the sheet is at rest. ahead_s: time from the
     measurement to the prediction. Return None if the edges are closer than `MIN_EDGE_DISTANCE_M`,
     or if a value is not finite.
     """

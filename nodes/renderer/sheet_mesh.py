@@ -85,9 +85,9 @@ def deflected_mesh(
 ) -> SheetMesh:
     """Return the mesh of a sheet that is stretched, sags by its weight and is pushed by a finger.
 
-    The deflection of a flat sheet is added to the ruled surface between the edges. The sag and the
-    indentation are added. The depth of the indentation is that of the finger below the sagging
-    sheet.
+    The deflection is the sum of the sag and the indentation of a flat sheet. It is added to the
+    ruled surface between the edges. The depth of the indentation is the depth of the finger below
+    the sagging sheet.
     """
     rubber = basis.rubber
     stretch = sheet.edge_distance_m / rubber.width_m

@@ -16,8 +16,8 @@ from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 class SheetPosePredictor:
     """A predictor of the sheet's pose from the measured flange poses of the arms.
 
-    If no valid pose is newer than `max_age`, the predictor returns the last valid sheet. Then the
-    attribute `note` contains the reason. Otherwise, `note` is empty.
+    If no valid pose is newer than `max_age`, the predictor returns the last valid sheet. In this
+    case, the attribute `note` contains the reason. Otherwise, `note` is empty.
     """
 
     def __init__(self, max_age: MaxAge) -> None:

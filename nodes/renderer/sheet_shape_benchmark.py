@@ -1,7 +1,7 @@
 """Measure the time and the error of the methods that compute the shape of a pushed sheet.
 
-The error is the difference in height between the mesh of a method and a reference sheet. The error
-is computed at the points of the reference. The caller provides the reference.
+The error is the difference in height (world z) between the mesh of a method and a reference sheet.
+The error is computed at the points of the reference. The caller provides the reference.
 """
 
 from __future__ import annotations

@@ -18,7 +18,9 @@ MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
 time amplifies noise, and a longer time causes lag."""
 
 MAX_PERIOD_S = 0.12
-"""The maximum time (s) between two successive responses up to which they are extrapolated."""
+"""The maximum time (s) between two successive responses. If the time is longer, they are not
+extrapolated.
+"""
 
 MAX_EXTRAPOLATION_S = 0.06
 """The maximum time over which the displacement is extrapolated, in seconds."""

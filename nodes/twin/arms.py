@@ -284,12 +284,12 @@ class Controller:
     The controller refuses a command with an invalid magic number, version, CRC, mode or sequence
         number by a Modbus exception. Four faults make the arm brake: joint angles out of range,
         joint angles that are not finite, a jump of the set-point, and no command for `watchdog_s`
-        while moving. A command with the mode `idle` clears a fault and may restart the sequence
-        numbers.
+        while the arm moves. A command with the mode `idle` clears a fault and may restart the
+        sequence numbers.
 
     noise_rad: standard deviation of the measured joint angles.
-    cycle_s: period of the controller. A set-point takes effect when the next cycle begins. With 0,
-        set-points take effect immediately.
+    cycle_s: period of the controller. A set-point takes effect when the next cycle begins. If it is
+        0, set-points take effect immediately.
     cycle_jitter_s: standard deviation of the start of a cycle.
     latency_s: time from the arrival of a set-point until it is ready for the next cycle.
     """

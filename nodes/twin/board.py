@@ -31,8 +31,9 @@ BORDER_SQUARES = 0.6
 
 TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
 HEIGHT_FRACTIONS = (0.95, 0.5, 0.75, 0.35, 0.6)
-"""The fractions of the image height that the board without tilt fills in successive poses.
-`TILTS_RAD` contains the tilts of the same poses."""
+"""The fractions of the image height that the board would fill in successive poses if it were not
+tilted. `TILTS_RAD` contains the tilts of the same poses.
+"""
 
 MARGIN_PX = 6.0
 MIN_CHARUCO_FRACTION = 0.6

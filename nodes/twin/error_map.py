@@ -1,9 +1,9 @@
-"""Measure the image error at each point of the object by drawn position codes.
+"""Measure the image error at each point of the object from position codes that are drawn on it.
 
 In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point encodes the x
-or y at which the eye should see the point on the imaginary screen (z = 0). Red and green are the
-cosine and the sine of a phase. Blue encodes the coarse position. The image error is the position at
-which the eye sees a point minus the encoded position.
+or y coordinate at which the eye should see the point on the imaginary screen (z = 0). Red and green
+are the cosine and the sine of a phase. Blue encodes the coarse position. The image error is the
+position at which the eye sees a point minus the encoded position.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ErrorMap:
     """The image error at each visible point of the object.
 
     errors_m (rows, columns, 2): actual minus expected position as seen by the eye, m, with x to the
-        right and y up; NaN where no point can be decoded.
+        right and y up. The error is NaN if no point can be decoded at a pixel.
     """
 
     errors_m: Floats

@@ -260,7 +260,7 @@ def seen(
 
     projected: projected image (height, width, 3). eye (3,): position, m.
 
-    The image is black where there is no sheet and where a fold of the sheet blocks the light.
+    A pixel is black if its rays miss the sheet, or if a fold of the sheet blocks the light.
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
     projector = TrueProjector(require_projector(scene), vertices, triangles)
@@ -406,11 +406,15 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return the first and the last row (px) of the object at a column; all are fractional."""
+        """Return the first and the last row (px) of the object at a column. All three values can be
+        fractional.
+        """
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Return the first and the last column (px) of the object at a row; all are fractional."""
+        """Return the first and the last column (px) of the object at a row. All three values can be
+        fractional.
+        """
         return self._ends_between(self._gray, row)
 
     def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:

@@ -76,7 +76,7 @@ class TwinEyeNode(Node):
     from this eye.
 
     The sheet has its shape at the time at which the projector shows the frame. This time is a few
-    milliseconds after the frame arrives. The finger position is that of the latest exposure. The
+    milliseconds after the frame arrives. The finger position is taken from the latest exposure. The
     deformation is the latest result of the soft-body solver.
     """
 

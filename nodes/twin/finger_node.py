@@ -310,7 +310,7 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return the maximum delay (ns) of an exposure without a missed frame.
+        """Return the maximum delay (ns) of an exposure that does not cause a missed frame.
 
         An exposure may overlap the read-out of the previous frame.
         """

@@ -203,7 +203,9 @@ class CoupledFinger:
         return position + self.deviation_m, velocity + self.rate_m_per_s
 
     def advance(self, until_s: float, edges: Edges) -> None:
-        """Integrate the motion until `until_s`; an earlier time has no effect."""
+        """Integrate the motion until `until_s`. If the motion is already computed to this time, do
+        nothing.
+        """
         span_s = until_s - self.time_s
         if span_s <= 0.0:
             return

@@ -76,7 +76,7 @@ class TrueRubber:
 
     width_m: free length of the unstretched sheet between the clamps. height_m: length along the
         clamps.
-    density_kg_per_m3: 0 for a sheet without weight.
+    density_kg_per_m3: density of the rubber; 0 if the weight is neglected.
     thickness_gradient: relative change of the thickness from the left to the right clamp, and from
         the lower to the upper end of the clamps.
     """
@@ -457,7 +457,7 @@ def solve(
     finger_tip: deepest point (3,), m, of the fingertip sphere. There is no contact if the point is
         None, in front of the sheet, or beside the sheet.
 
-    The other arguments and the errors are those of `solve_path`.
+    The other arguments and the exceptions are the same as for `solve_path`.
     """
     return solve_path(
         rubber,

@@ -41,7 +41,7 @@ class Nail:
         """Compute the placement from the true finger parameters.
 
         In the finger's frame, x points from the tip to the knuckle, and z points out of the nail.
-        For a finger without tilt, y points to the right.
+        If the finger is not tilted, y points to the right.
         """
         tilt = rotation_from_vector((*finger.finger_tilt_rad, 0.0))
         x = tilt @ np.array(FINGER_DIRECTION)
@@ -59,7 +59,7 @@ class Nail:
         )
 
     def find_normal(self, radius_m: float) -> Floats | None:
-        """Return the direction (3,) from the finger's axis to the nail; None for a round finger.
+        """Return the direction (3,) from the finger's axis to the nail; None if it is round.
 
         radius_m: half of the finger's breadth.
         """

@@ -296,7 +296,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
     The samples are limited to the scene's finger volume and joined by a spline, which preserves the
     recorded tremor.
 
-    Raises FingerPathError for an invalid file.
+    Raises FingerPathError if the file is invalid.
     """
     recorded = _read_recording(csv_path)
     times_s, points = recorded[:, 0] - recorded[0, 0], recorded[:, 1:] * 1e-3
@@ -344,7 +344,8 @@ def _soft_clip(values: Floats, half: float) -> Floats:
 def _read_recording(csv_path: Path) -> Floats:
     """Read the columns t_s, x_mm, y_mm, z_mm of a CSV file as an array (n, 4).
 
-    Raises FingerPathError for an invalid file. The error names the file, the line and the reason.
+    Raises FingerPathError if the file is invalid. The error names the file, the line and the
+    reason.
     """
     wanted = ["t_s", "x_mm", "y_mm", "z_mm"]
     try:

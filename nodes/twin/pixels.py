@@ -211,8 +211,8 @@ class TwinCamera:
         """Render the static background of both cameras.
 
         camera: true lenses and poses of the stereo camera.
-        nail: marker position and finger direction; None for a bead at the fingertip.
-        skew_s: exposure time of the right image minus that of the left image.
+        nail: marker position and finger direction; None if the marker is a bead at the fingertip.
+        skew_s: exposure time of the right image minus the exposure time of the left image.
         """
         self.camera = camera
         self.skew_s = skew_s
@@ -278,7 +278,7 @@ class TwinCamera:
     ) -> tuple[Singles, Singles]:
         """Render the left and right image (height, width) without noise, saturation and rounding.
 
-        The arguments are those of `picture`.
+        The arguments are the same as for `picture`.
         """
         pictures = []
         for eye, instants_s, tips in self._views(position, exposure_s):
@@ -320,7 +320,9 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
-        """Return a noisy background with the drawn windows of the canvas; reset the canvas."""
+        """Return the camera image: the drawn rectangles (`windows`) of the canvas on a noisy
+        background. Then reset the canvas.
+        """
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
             image[window] = self._read_out(eye.canvas[window])

@@ -123,7 +123,7 @@ class LitSheet:
         """Render the left and right images of patterns that are projected onto the sheet.
 
         world_from_sheet: pose (4, 4) of the sheet.
-        points (n, 3): points of a sheet that sags by its weight, m; None for a flat sheet.
+        points (n, 3): points of a sheet that sags by its weight, m; None if the sheet is flat.
         """
         bend = None if points is None else _fit_bend(apply(inverse(world_from_sheet), points))
         world_from_left = pose_matrix(self._camera.world_from_left)

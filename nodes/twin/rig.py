@@ -150,8 +150,8 @@ def pixels_per_slope(lens: Lens, slope_x: float, slope_y: float) -> float:
 def slopes_of(lens: Lens, pixels: Floats) -> Floats:
     """Return the slopes x/z and y/z (..., 2) of the rays through pixels (..., 2).
 
-    The function inverts `pixels_of` by Newton's method. The result is valid where different rays
-    have different pixels.
+    The function inverts `pixels_of` by Newton's method. The result is valid in the part of the
+    image in which each pixel belongs to a single ray.
     """
     x_px, y_px = pixels[..., 0], pixels[..., 1]
     # Separate arrays, because numpy is about twice as fast with contiguous ones.

@@ -81,7 +81,7 @@ class SheetPull:
     distances_m, forces_n (n,): tension as a function of the distance between the clamped edges.
     compliances_m_per_n: displacement of the left and right flange per force.
     weight_n (3,): weight of the sheet. Each flange carries half of the weight.
-    history: hysteresis and creep of the tension; None for elastic rubber.
+    history: hysteresis and creep of the tension; None if the rubber is elastic.
     """
 
     distances_m: Floats

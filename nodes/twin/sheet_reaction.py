@@ -65,7 +65,7 @@ class SheetReaction:
     ratios: Floats
 
     def curve_n(self, distance_m: float, x_m: float, y_m: float) -> Floats:
-        """Return the forces (d,), N, at `depths_m`; zeros for a position beside the sheet.
+        """Return the forces (d,), N, at `depths_m`; zeros if the position is beside the sheet.
 
         distance_m: distance between the edges. x_m, y_m: position relative to the sheet's centre.
         """

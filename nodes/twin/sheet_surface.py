@@ -22,7 +22,8 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 CELLS = 8
 """The number of finite elements along each side of the sheet. In the usable part of the sheet, the
-sag differs by 0.3 % from that with 32 elements."""
+sag differs by 0.3 % from the sag with 32 elements.
+"""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
@@ -137,7 +138,7 @@ def _cached_table(rubber: TrueRubber, low: float, high: float) -> SagTable:
 class SheetSurface:
     """The surface of a scene's unloaded sheet.
 
-    table: sag of the sheet; None for a sheet without weight.
+    table: sag of the sheet; None if the sheet has no weight.
     """
 
     table: SagTable | None

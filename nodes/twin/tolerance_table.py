@@ -31,8 +31,8 @@ class Profile(StrEnum):
     """The age of the laboratory's equipment.
 
     MODERN: a 60 Hz camera with a short read-out, and robot controllers with a short period.
-    PAPER: equipment as in Furukawa et al. 2007. The camera has 15 to 48 Hz, and its read-out takes
-        most of a frame period. The controller period is 7.1 ms.
+    PAPER: equipment as in Furukawa et al. 2007. The camera rate is 15 to 48 Hz, and its read-out
+        takes most of a frame period. The controller period is 7.1 ms.
     """
 
     MODERN = "modern"
@@ -375,8 +375,8 @@ def deviate_apparatus(
     """Make an apparatus (true hardware parameters) in which only one parameter deviates.
 
     key: row of the tolerance table; other keys raise KeyError. sigmas: size of the deviation, in
-    standard deviations of a normal distribution. All components of a vector deviate equally, and so
-    do both arms or lenses.
+    standard deviations of a normal distribution. All components of a vector deviate equally. Both
+    arms or lenses also deviate equally.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)

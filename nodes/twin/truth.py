@@ -47,8 +47,8 @@ class SimulatorParameters(NodeParameters):
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
     """Return the delay (s) of the true display of a frame after the time that the renderer assumes.
 
-    The frame contains the latency that the renderer assumes. Without a displayed frame, the nominal
-    latency is used. The result is 0 without an apparatus.
+    The frame contains the latency that the renderer assumes. If no frame has been displayed, the
+    nominal latency is used. The result is 0 if there is no apparatus.
     """
     if apparatus is None:
         return 0.0
@@ -61,9 +61,9 @@ def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> fl
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
     """Return the scene with the true parameters of the devices.
 
-    Without an apparatus, the scene is returned. Virtual objects and requirements are unchanged. The
-    returned camera has the lenses of its data sheet plus the offsets in the apparatus. The function
-    `make_true_camera` adds the deviations of the individual camera.
+    If there is no apparatus, the scene is returned unchanged. Virtual objects and requirements are
+    unchanged. The returned camera has the lenses of its data sheet plus the offsets in the
+    apparatus. The function `make_true_camera` adds the deviations of the individual camera.
     """
     if apparatus is None:
         return scene

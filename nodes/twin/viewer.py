@@ -40,7 +40,9 @@ class HeadSway:
 
     @classmethod
     def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
-        """Generate a random head motion from the true eye parameters; None for a head at rest."""
+        """Generate a random head motion from the true eye parameters. Return None if the head is at
+        rest.
+        """
         if not eyes.sway_m:
             return None
         band_hz = (MIN_SWAY_FREQUENCY_RATIO * eyes.sway_frequency_hz, eyes.sway_frequency_hz)
@@ -59,7 +61,7 @@ class Viewer:
     ) -> None:
         """Store the eyes of the scene and the motion of the head.
 
-        sway: motion of the head; None for a head at rest. random: generator of the alignment
+        sway: motion of the head; None if the head is at rest. random: generator of the alignment
         errors.
         """
         self._eyes, self._sway, self._random = true_scene.eyes, sway, random
@@ -76,7 +78,7 @@ class Viewer:
         The point contains a random alignment error. Return None if the sheet is not behind the
         bead.
 
-        bead (3,): position, world frame, m.
+        bead (3,): position of the bead, world frame, m.
         """
         eye = self.locate_eye(side, time_s)
         error = rotation_from_vector(self._random.normal(0.0, ALIGNMENT_RAD, 3))

@@ -43,7 +43,7 @@ class Focus:
 
     x_m: position along the axis. angle_rad: angle from +z. near_m: distance within which elements
     have the requested size. growth: increase of the element size per distance beyond `near_m`
-    (m/m); None for `FOCUS_GROWTH`.
+    (m/m); None selects `FOCUS_GROWTH`.
     """
 
     x_m: float
@@ -66,11 +66,11 @@ def cylinder_mesh(
 
     support_angle_rad: full angle of the fixed strip, which is centred on -z. touch_angle_rad: half
     angle of the touchable skin, which is centred on +z. skin_spacing_m: distance between touchable
-    nodes. focus: point around which the mesh is fine; None for a mesh that is fine on all touchable
-    skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for y = 0.
-    The mesh contains only the half with positive coordinates. Elements are larger inside and at the
-    back of the cylinder. Raises ValueError for a spacing that is too large for the cylinder, or for
-    invalid angles.
+    nodes. focus: point around which the mesh is fine; if it is None, the mesh is fine on all
+    touchable skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for
+    y = 0. The mesh contains only the half with positive coordinates. Elements are larger inside and
+    at the back of the cylinder. Raises ValueError if the spacing is too large for the cylinder, or
+    if the angles are invalid.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
@@ -176,8 +176,8 @@ def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> F
     """Return the x coordinates (s,), m, of the cross-sections, including both ends of the cylinder.
 
     If the sizes have a focus (a point near which the mesh is fine), one cross-section is at the
-    focus. Within `near_m` of it, the distances are equal. With the plane of symmetry x = 0, only x
-    >= 0 is returned.
+    focus. Within `near_m` of the focus, the distances are equal. If x = 0 is a plane of symmetry,
+    only values x >= 0 are returned.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -267,7 +267,8 @@ def _focused_disc(
 
     The cross-section is symmetric about the diameter through the focus, except at the ends of the
     support. In an asymmetric mesh, the force on the finger would have a sideways component of a few
-    percent of its magnitude. With the plane of symmetry y = 0, only the half y >= 0 is returned.
+    percent of its magnitude. If y = 0 is a plane of symmetry, only the half with y >= 0 is
+    returned.
     """
     near = focus.near_m / radius_m
     inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
@@ -306,8 +307,9 @@ def _circle(radius: float | Floats, angles: Floats) -> Floats:
 def _triangles(points: Floats, where: Floats) -> Ints:
     """Triangulate points, and return counter-clockwise triangles (t, 3) of point indices.
 
-    points (n, 2): true positions. where (n, 2): positions that the Delaunay triangulation uses to
-    select the connected points. They may differ from `points`. Triangles without area are omitted.
+    points (n, 2): true positions. where (n, 2): positions from which the Delaunay triangulation
+    selects the connected points. These positions can differ from `points`. Triangles without area
+    are omitted.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
@@ -325,8 +327,8 @@ def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[
 
     points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the cross-sections, m. The
     diagonals alternate between slices, so that the mesh has no preferred direction. swapped: index
-    of a slice whose ends are exchanged before it is divided. Every second slice from this one is
-    exchanged, too.
+    of a slice whose ends are exchanged before it is divided. Starting with this slice, every second
+    slice is exchanged.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])

@@ -7,8 +7,8 @@ highly deformable objects with tetrahedra", 2003), on a bisected lattice:
     sharply curved.
 2. Lattice vertices that are deep enough inside the surface form the core. All tetrahedra with a
     core vertex are used. Therefore every tetrahedron has a corner inside and at most one boundary
-    face. Where the boundary touches itself in an edge or a vertex (a pinch), vertices are removed
-    from the core.
+    face. If the boundary touches itself in an edge or a vertex (a pinch), vertices are removed from
+    the core.
 3. The boundary is moved to the surface while the element shapes are optimized (`smoothing`).
 
 The method is deterministic. Parts thinner than the smallest elements are omitted.
@@ -91,7 +91,7 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
     """Return nodes (n, 3) and elements (e, 10) of the solid inside the surface of a shape.
 
     low_m, high_m (3,): corners of the bounding box of the shape. grading: required element sizes.
-    Raises UnfitMeshError for a shape that is too thin for elements of these sizes.
+    Raises UnfitMeshError if the shape is too thin for elements of these sizes.
     """
     cell = INITIAL_CELL_RATIO * grading.element_m
     field = _SurfaceCache(shape, 0.5 * (low_m + high_m), cell)
@@ -180,7 +180,7 @@ def _cover_with_lattice(
 
 
 def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return the length (n,) of the shortest edge at each vertex."""
+    """Return the length (n,) of the shortest edge at each of the n vertices."""
     ends = tetrahedra[:, EDGES].reshape(-1, 2)
     length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     shortest = np.full(len(points), np.inf)

@@ -133,9 +133,9 @@ def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
 def world_from_mesh(scene: Scene) -> Floats:
     """Return the pose (4, 4) of the mesh frame in the world.
 
-    The pose is that of the object. For a cylinder, it is also rotated about the axis so that z
-    points to the user. Raises ValueError if the axis of a cylinder points to the user, because its
-    side cannot be touched.
+    The mesh frame is the object frame. For a cylinder, it is also rotated about the cylinder's axis
+    so that z points to the user. Raises ValueError if the axis of a cylinder points to the user,
+    because its side cannot be touched.
     """
     world_from_object = _world_from_object(scene)
     if not isinstance(scene.object.geometry, Cylinder):
@@ -173,8 +173,8 @@ def estimate_node_count(spec: MeshSpec, shape: Shape) -> int:
     Nodes are half an element size apart. Therefore the number of inner nodes is about the integral
     of (2 / element size)^3 over the volume. The number of skin nodes is about the integral of (2 /
     element size)^2 over the surface. Measured factors such as `INNER_FACTOR` correct both numbers.
-    The estimate takes at most a second. Raises UnfitMeshError for a skin spacing that does not fit
-    the object or requires more than `MAX_NODES` nodes.
+    The estimate takes at most a second. Raises UnfitMeshError if the skin spacing does not fit the
+    object or requires more than `MAX_NODES` nodes.
     """
     low, high = _box(spec)
     spacing, thickness = spec.skin_spacing_m, float((high - low).min())

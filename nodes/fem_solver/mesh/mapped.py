@@ -5,9 +5,9 @@ s = max |u_i|, the point w = u / s is on the surface of the cube. The vertex is 
 
     x(u) = c u + s^2 (X(w) - c w)
 
-X maps the surface of the cube to that of the solid (`CuboidMap.surface`). c contains half extents
-(`CuboidMap.inner_m`). Near the centre, the lattice is only scaled by c. The meshes of symmetric
-solids are symmetric.
+X maps the surface of the cube to the surface of the solid (`CuboidMap.surface`). c contains half
+extents (`CuboidMap.inner_m`). Near the centre, the lattice is only scaled by c. The meshes of
+symmetric solids are symmetric.
 """
 
 from __future__ import annotations

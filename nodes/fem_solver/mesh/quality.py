@@ -29,11 +29,11 @@ def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:
 def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
     """Return the radius ratio (e,) of each tetrahedron, a measure of its quality.
 
-    The ratio is 3 r / R, where r is the radius of the inscribed sphere and R that of the
-    circumscribed sphere. It is 1 for a regular, 0 for a flat and negative for an inverted
-    tetrahedron. Crelle's formula gives R from the volume V: 24 V R = sqrt(p (p - 2 a) (p - 2 b) (p
-    - 2 c)). In this formula, a, b and c are the products of the lengths of opposite edges, and p =
-    a + b + c.
+    The ratio is 3 r / R, where r is the radius of the inscribed sphere and R the radius of the
+    circumscribed sphere. The ratio is 1 if the tetrahedron is regular, 0 if it is flat, and
+    negative if it is inverted. Crelle's formula gives R from the volume V: 24 V R = sqrt(p (p - 2
+    a) (p - 2 b) (p - 2 c)). In this formula, a, b and c are the products of the lengths of opposite
+    edges, and p = a + b + c.
     """
     corners = points[tetrahedra[:, :4]]
     volume = signed_volumes(points, tetrahedra)

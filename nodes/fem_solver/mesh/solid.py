@@ -37,10 +37,11 @@ class SolidMesh:
     """A solid mesh of 10-node tetrahedra.
 
     nodes (n, 3): positions, m, mesh frame. elements (e, 10): node indices. fixed (n,): whether each
-    node is fixed. skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`,
-    ordered for outward normals. contact_nodes (m,): sorted indices of the nodes on the skin that
-    the finger can touch. contact_normals (m, 3): outward normals at these nodes. contact_faces (f,
-    6): six-node triangles as indices into `contact_nodes`, ordered for outward normals.
+    node is fixed. skin (s,): indices of the nodes on the surface. skin_triangles (t, 3): indices
+    into `skin`, ordered for outward normals. contact_nodes (m,): sorted indices of the nodes on the
+    skin that the finger can touch. contact_normals (m, 3): outward normals at these nodes.
+    contact_faces (f, 6): six-node triangles as indices into `contact_nodes`, ordered for outward
+    normals.
     """
 
     nodes: Floats
