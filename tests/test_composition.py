@@ -172,6 +172,24 @@ def test_a_cheaper_configuration_is_tried_if_the_prediction_was_too_large() -> N
     assert found.chosen["sheet-force"].method == "linear"
 
 
+def test_a_metric_that_the_graph_does_not_measure_has_its_predicted_value() -> None:
+    skin = SystemMetric.SKIN
+    stages = {
+        "soft-body": [
+            StageOption("coarse", 0.01, biases={FORCE_ERROR: 12.0, skin: 0.4}),
+            StageOption("fine", 0.05, biases={FORCE_ERROR: 3.0, skin: 0.2}),
+        ]
+    }
+
+    def run_graph(combination: Combination) -> Figures:
+        return {FORCE_ERROR: predict(combination)[FORCE_ERROR] / 3.0}
+
+    found = compose(stages, {FORCE_ERROR: 10.0, skin: 1.0}, run_graph, margin=0.2)
+    assert [run.measured[skin] for run in found.runs] == [0.2, 0.4]
+    assert found.accepted
+    assert found.chosen["soft-body"].method == "coarse"
+
+
 def test_the_method_with_the_fewest_cases_out_of_range_is_preferred() -> None:
     """The error of a method counts only within its range, so a small range must not help it."""
     stages = {

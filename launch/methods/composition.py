@@ -314,7 +314,7 @@ def compose(
     tried: list[Combination] = []
 
     def run(proposed: Combination) -> GraphRun:
-        measured = run_graph(proposed)
+        measured = {**predict(proposed), **run_graph(proposed)}
         exceeded = excess(measured, tolerances)
         tried.append(proposed)
         runs.append(
