@@ -697,8 +697,8 @@ class BagReader:
         """
         if channel.topic not in TOPICS:
             raise BagError(
-                f'{self.path}: topic "{channel.topic}" does not exist any more in this version; '
-                "`BagReader.frames` returns its bytes without decoding"
+                f'{self.path}: this version of flexsheet has no topic "{channel.topic}"; '
+                "`BagReader.frames` returns its messages without decoding"
             )
         migration = self._find_migration(channel)
         if migration is None:

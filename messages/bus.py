@@ -602,7 +602,8 @@ class _Writer:
             return lost
         elif header.epoch < self.epoch:
             raise WireError(
-                "replayed", f"a message of {header.writer} was sent before its last restart"
+                "replayed",
+                f"a message from {header.writer} was sent before the writer's last restart",
             )
         self.epoch, self.sequence = header.epoch, header.sequence
         return 0

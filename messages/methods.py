@@ -11,6 +11,8 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from flexsheet.messages.limits import LimitedModel
+
 T = TypeVar("T", bound=str | float)
 
 MarkerMethod = Literal["moments", "subpixel_fit"]
@@ -22,7 +24,7 @@ SoftBodyMethod = Literal["linear", "nonlinear_table"]
 ComplianceMode = Literal["force_curve", "stiffness", "constant_stretch"]
 
 
-class SoftBodyChoice(BaseModel):
+class SoftBodyChoice(LimitedModel):
     """The method for the soft body's deformation, and the vertex spacing of its surface mesh."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -208,7 +208,7 @@ def read_envelope(
     if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
         raise WireError(
             "malformed",
-            f"the message has the protocol {_format_value(protocol)}, expected {PROTOCOL}",
+            f"the message has the protocol {_format_value(protocol)} instead of {PROTOCOL}",
         )
     plan = unpacked[9] if len(unpacked) == 11 else ""
     fields = unpacked[-1]

@@ -414,7 +414,7 @@ def test_the_report_names_residuals_limits_and_advice(tmp_path: Path) -> None:
         (lambda folder: (folder / "notes.txt").write_text("x"), "not empty and has no commission"),
         (
             lambda folder: (folder / "commission.json").write_text("{]"),
-            "this is not a valid state of a",
+            "not a valid commissioning state",
         ),
     ],
 )

@@ -177,7 +177,7 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
         ("texture: image, image_file: gone.png", 'image_file.*"gone.png".*No such file'),
         ("texture: image, image_file: skin.tif", r"convert the file to \.png"),
         ("texture: image, image_file: bad.png", "damaged"),
-        ("texture: image, image_file: huge.png", "2050x1 pixels, at most 2048"),
+        ("texture: image, image_file: huge.png", "2050x1 pixels, but at most 2048"),
         ("texture: grid, image_file: bad.png", "image_file requires `texture: image`"),
         ("texture: image, image_file: 7", "the value is not a file name"),
         ("texture: image", "needs an image"),

@@ -401,7 +401,7 @@ def test_removed_topic(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         bag_module, "TOPICS", {n: t for n, t in TOPICS.items() if n != "twin/finger"}
     )
-    with pytest.raises(BagError, match='topic "twin/finger" does not exist any more'):
+    with pytest.raises(BagError, match='this version of flexsheet has no topic "twin/finger"'):
         list(BagReader(whole))
 
 

@@ -167,5 +167,5 @@ def draw_fields(series: Sequence[FieldSeries], image: Path, *, title: str) -> No
         figure.savefig(image)
     except (OSError, ValueError) as error:
         raise BadInputError.single(
-            str(image), (), f"cannot be written: {error}", "name a .svg or .png file"
+            str(image), (), f"the image cannot be written: {error}", "name a .svg or .png file"
         ) from error

@@ -155,7 +155,8 @@ def verify(
 
     name: name of the node.
     tolerance: maximum difference of a field that counts as equal.
-    progress: function that is called with the numbers of replayed and of all messages.
+    progress: function that is called with the number of replayed messages and the total number of
+        messages.
 
     Raises BagError if the bag does not contain the node, its inputs or a valid launch file, or if
     the node cannot be replayed.

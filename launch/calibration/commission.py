@@ -526,7 +526,9 @@ def list_doubts(
     tracking: tuple[float, float],
     check_command: str,
 ) -> list[str]:
-    """Return the reasons why a laboratory may exceed a tolerance; empty if there are none.
+    """Return the reasons why the errors of a laboratory may exceed a tolerance.
+
+    The list is empty if there are no reasons.
 
     figures: results of the step "verification".
     tracking: error (mm) of the sheet during the stroke as the devices report it, and its tolerance

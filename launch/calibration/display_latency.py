@@ -140,7 +140,7 @@ def classify_images(
 
 
 def read_switch_images(bag: Path, stamp_offset_s: float = 0.0) -> list[SwitchImage]:
-    """Read the camera images after switches of the projected image from a bag.
+    """Read from a bag the camera images that follow each switch of the projected image.
 
     Return an empty list if the bag contains no switch.
 

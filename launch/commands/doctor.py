@@ -98,9 +98,9 @@ def check_scene(
     exit code is 1 if the arms cannot reach a sample. If they reach all samples but are too slow, a
     warning is printed.
 
-    In the joint solution of an RV-1A or RV-2FR, shoulder front means that the wrist centre is in
-    front of the plane through the axes of J1 and J2. Elbow up means that J3 is above the angle of
-    the straight arm, and wrist flipped means that J5 is negative.
+    In the joint solution of an RV-1A or RV-2FR, "shoulder front" means that the wrist centre is in
+    front of the plane through the axes of J1 and J2. "Elbow up" means that J3 is greater than its
+    angle when the arm is straight, and "wrist flipped" means that J5 is negative.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene

@@ -37,7 +37,8 @@ IMAGES: tuple[tuple[image.Series, float, tuple[Correction, ...]], ...] = (
     (image.TILT, -40, ("none", "one_plane", "two_pass")),
     (image.PUSH, 30, ("none", "four_triangles", "two_pass")),
 )
-"""The image experiments, each with one value and its corrections of the image."""
+"""The image experiments: the varied quantity, its value (tilt in degrees, depth in mm), and the
+methods of image correction that are compared."""
 
 
 @dataclass(slots=True)

@@ -75,9 +75,9 @@ settled."""
 
 HOVER_M = 0.03
 METRES_PER_PX = 0.0014
-"""The resolution of the images, in metres per pixel.
+"""The resolution of the rendered coordinate images, in metres per pixel.
 
-The error map interpolates between the drawn coordinates.
+The error map interpolates between their pixels.
 """
 
 FORCE_STEP_S, FORCE_REST_S = 1.0 / 60.0, 1.5

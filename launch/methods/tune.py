@@ -370,9 +370,9 @@ def tune(
     margin: float = MARGIN,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Choice]:
-    """Measure the methods of all given families in order, and choose one method per family.
+    """Measure the methods of each family in `tunables` in order, and choose one method per family.
 
-    Errors are raised if a method family does not support the scene's shape, mesh or sheet.
+    If a method family does not support the scene's shape, mesh or sheet, its error is passed on.
 
     margin: fraction of each tolerance that is reserved.
     """

@@ -40,7 +40,7 @@ class UrdfError(FlexsheetError, ValueError):
 
 
 class UrdfArm(LimitedModel):
-    """The model of an arm in a scene file that refers to a URDF file."""
+    """An arm model that a scene file specifies by the path of a URDF file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

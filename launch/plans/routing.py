@@ -86,7 +86,8 @@ def resolve_further_inputs(
 ) -> None:
     """Add the inputs that depend on node parameters, such as the topics of a recorder.
 
-    writers: (writer, host) pairs by topic. Problems are reported to `document`.
+    writers: (writer, host) pairs by topic.
+    document: launch file to which problems are reported.
     """
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:

@@ -277,7 +277,7 @@ class Replay:
         return list_bags(self._folder)
 
     def open(self, name: str) -> None:
-        """Open a bag of the folder by its name, and play it from its start.
+        """Open the bag `name` in the folder of bags, and play it from its start.
 
         Raises BagError if the file is not a readable bag.
         """

@@ -49,8 +49,8 @@ SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
 are `DELAYS_S` and `BANDWIDTHS_RAD_PER_S`."""
 
 FILTER_DAMPING_RATIO = 0.5
-"""The damping ratio of the filter of the finger's depth. If the ratio were larger, the control loop
-would be unstable at smaller sheet offsets."""
+"""The damping ratio of the filter of the finger's depth. With a larger ratio, the control loop
+would already become unstable at smaller sheet offsets."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,8 +102,8 @@ class ComplianceController:
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
         """Set the delay from the measurement of a depth to the motion of the sheet.
 
-        If the new delay changes the bounds and there is no contact, stretch and offset are fitted
-        again.
+        If the new delay changes the stability bounds of the offset, and the finger does not touch
+        the sheet, stretch and offset are fitted to the object's force curve again.
         """
         self.delay_s = delay_s
         if self._bounds is None or in_contact:

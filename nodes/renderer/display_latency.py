@@ -75,7 +75,9 @@ class DisplayLatencyEstimator:
     def is_late(self, light_ns: int, predicted_ns: int) -> bool:
         """Return whether a frame was displayed later than predicted.
 
-        light_ns, predicted_ns: measured and predicted display time. The tolerance is half a refresh
-        period, and at least the display latency.
+        A frame is late if it exceeds the prediction by more than the larger of half a refresh
+        period and the display latency.
+
+        light_ns, predicted_ns: measured and predicted display time.
         """
         return light_ns - predicted_ns > max(self._period_ns // 2, self._light_ns)

@@ -387,9 +387,9 @@ def _make_marker(
 
 
 MAX_ELLIPSE_MISFIT = 0.035
-"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height
-(its grey levels above its surroundings). The limit is smaller than for a disc, because an ellipse
-fits a partly covered disc well."""
+"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's contrast
+to its surroundings. The limit is stricter than the limit of the disc fit, because an ellipse can
+also fit a partly covered disc well."""
 
 MAX_ODD_MISFIT = 0.03
 """The maximum odd (antisymmetric about the centre) part of the residual of an ellipse fit, as a

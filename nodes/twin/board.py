@@ -296,9 +296,12 @@ class TwinBoard:
 
 
 def _measure_rise(place: Singles) -> Singles:
-    """Return the change (rows, columns) of values (rows, columns) between adjacent rays.
+    """Return how much a board coordinate changes from one ray to the next ray of a row or column.
 
-    The change is computed at one ray per pixel, because it varies little within a pixel.
+    Each pixel has several rays. The change is computed for one of them, because it hardly varies
+    within a pixel.
+
+    place: board coordinate (rows, columns) of each ray.
     """
     rows, columns = place.shape
     step = RAYS if min(rows, columns) >= 2 * RAYS else 1

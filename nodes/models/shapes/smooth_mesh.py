@@ -62,8 +62,8 @@ MIN_NORMAL_COSINE = 0.2
 """The minimum cosine of the angle between two normals: of a local quadratic fit (jet), and of a
 vertex that is used for the fit."""
 MAX_CURVATURE_RATIO = 2.0
-"""The maximum curvature (1/m) of a local quadratic fit (jet), multiplied by the smoothing length
-`rho` (m)."""
+"""The maximum product of the curvature (1/m) of a local quadratic fit (jet) and the smoothing
+length `rho` (m)."""
 EDGE = 1.5
 """The curvature above which a surface point counts as an edge, divided by the maximum curvature of
 a local quadratic fit (jet)."""
