@@ -203,7 +203,7 @@ async def test_invalid_messages_are_rejected_as_from_sockets(tmp_path: Path) -> 
         for words in (
             "may write to this endpoint",
             "runs plan",
-            "before its last restart",
+            "before the writer's last restart",
             "not allowed",
         ):
             assert any(words in problem for problem in reader.problems), words
