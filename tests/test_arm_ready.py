@@ -250,8 +250,8 @@ class CountingLink:
         self.modes.append("closed")
 
 
-async def test_an_arm_that_is_not_enabled_gets_fewer_commands_until_an_event() -> None:
-    clock, link = VirtualClock(10**9, clock_id="here"), CountingLink()
+async def make_bridge(clock: VirtualClock, link: CountingLink) -> ArmBridge:
+    """Make the bridge of the left arm with a simulated connection to the arm."""
     node = ArmBridge(
         ArmBridgeParameters(side="left"),
         name="bridge",
@@ -261,6 +261,12 @@ async def test_an_arm_that_is_not_enabled_gets_fewer_commands_until_an_event() -
     )
     await node.setup()
     node._link = link
+    return node
+
+
+async def test_an_arm_that_is_not_enabled_gets_fewer_commands_until_an_event() -> None:
+    clock, link = VirtualClock(10**9, clock_id="here"), CountingLink()
+    node = await make_bridge(clock, link)
 
     def header() -> Header:
         return Header(1, clock.now_ns(), clock.now_ns(), "here", "tools", 1)
@@ -286,15 +292,7 @@ async def test_an_arm_that_is_not_enabled_gets_fewer_commands_until_an_event() -
 async def test_failed_exchanges_are_counted_from_the_first_answer_on() -> None:
     """Earlier, the connection attempts before the start of the arm counted as failed exchanges."""
     clock, link = VirtualClock(10**9, clock_id="here"), CountingLink()
-    node = ArmBridge(
-        ArmBridgeParameters(side="left"),
-        name="bridge",
-        clock=clock,
-        send=lambda topic, message, header: None,
-        topics={"arm": "arm_left", "other_arm": "arm_right"},
-    )
-    await node.setup()
-    node._link = link
+    node = await make_bridge(clock, link)
 
     async def cycle(*, fails: bool) -> str:
         link.fails = fails

@@ -19,6 +19,7 @@ from flexsheet.launch.calibration.bundle import pose_vector
 from flexsheet.launch.calibration.capture import (
     TILTS,
     Bin,
+    BinGroup,
     Capture,
     classify_tilt,
     compute_required_counts,
@@ -240,27 +241,27 @@ def test_pair_is_taken_when_the_board_rests_at_a_new_position(camera: StereoCame
     hints = [capture.add_pair(*picture) for picture in (first, first, second, second, second)]
     assert [one.accepted for one in hints] == [False, False, False, False, True]
     assert hints[0].hint == "keep the board still"
-    assert capture.counts[Bin("pairs", "")] == 1
+    assert capture.counts[Bin(BinGroup.PAIRS)] == 1
     assert not capture.add_pair(*second).accepted
     assert capture.add_pair(*second).hint.startswith("pose already captured; show the board")
     assert [capture.add_pair(*first).accepted for _ in range(3)] == [False, False, True]
-    assert capture.counts[Bin("pairs", "")] == 2
+    assert capture.counts[Bin(BinGroup.PAIRS)] == 2
     assert not capture.complete
 
 
 def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
     capture = watching(camera, pairs=8, still_images=1)
     wanted = compute_required_counts(8)
-    assert {one.name for one in wanted if one.group == "tilt"} == set(TILTS)
-    assert Bin("left cell", "0,0") not in wanted
+    assert {one.name for one in wanted if one.group is BinGroup.TILT} == set(TILTS)
+    assert Bin(BinGroup.LEFT_CELL, cell=(0, 0)) not in wanted
     capture.counts.update(dict.fromkeys(wanted, 8))
     assert capture.complete
     for one, printed in (
-        (Bin("tilt", "left side back"), "with its left side tilted back"),
-        (Bin("tilt", "upright"), "facing the camera"),
-        (Bin("distance", "far"), "further away"),
-        (Bin("left cell", "3,2"), "at the bottom right of the left image"),
-        (Bin("pairs", ""), "in another pose"),
+        (Bin(BinGroup.TILT, "left side back"), "with its left side tilted back"),
+        (Bin(BinGroup.TILT, "upright"), "facing the camera"),
+        (Bin(BinGroup.DISTANCE, "far"), "further away"),
+        (Bin(BinGroup.LEFT_CELL, cell=(3, 2)), "at the bottom right of the left image"),
+        (Bin(BinGroup.PAIRS), "in another pose"),
     ):
         capture.counts[one] = 0
         assert capture.missing() == [one]
@@ -268,7 +269,7 @@ def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
         assert printed in capture._make_hint("")
         capture.counts[one] = 8
         assert picture[0].shape == (camera.height_px, camera.width_px)
-    top_left = Bin("right cell", "0,0")
+    top_left = Bin(BinGroup.RIGHT_CELL, cell=(0, 0))
     assert describe_requirement(top_left) == "at the top left of the right image"
 
 

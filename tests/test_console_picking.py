@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
-from flexsheet.messages.scene import Cylinder, Scene
+from flexsheet.messages.scene import Cylinder, Scene, require_cylinder
 from flexsheet.messages.types import (
     FingerPath,
 )
@@ -103,13 +103,13 @@ def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
 def depth_m(scene: Scene, point: Floats) -> float:
     """Return the depth (m) of a point below the side of the cylinder."""
     away = (point - scene.object.world_from_object.position_m)[1:]
-    return float(scene.object.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
+    return float(require_cylinder(scene).radius_m - np.linalg.norm(away))
 
 
 def test_a_drag_beside_the_object_stays_on_its_touchable_surface(scene: Scene) -> None:
     """Earlier, a drag beside the end of the cylinder moved the finger behind the sheet."""
     sent: list[FingerPath] = []
-    finger = FingerController(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
+    finger = FingerController(sent.append, speed_m_per_s=0.1)
     finger.use(SurfacePicker(scene))
     geometry, solid = scene.object.geometry, scene.object
     assert isinstance(geometry, Cylinder)
@@ -176,7 +176,7 @@ def test_a_push_deeper_than_the_working_range_is_refused(scene: Scene) -> None:
 def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:
     """Earlier, a new scene or lifting the finger reset the push depth."""
     sent: list[FingerPath] = []
-    finger = FingerController(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
+    finger = FingerController(sent.append, speed_m_per_s=0.1)
     finger.use(SurfacePicker(scene))
     finger.advance(0.05, None)
     assert not sent, "nobody has moved it yet"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -28,8 +29,9 @@ from flexsheet.nodes.renderer.correction import (
     make_flat_screen,
     make_pushed_screen,
 )
+from flexsheet.nodes.renderer.frame_renderer import FrameRenderer
 from flexsheet.nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
-from flexsheet.nodes.renderer.node import Renderer, RendererParameters
+from flexsheet.nodes.renderer.node import READ_TIME_NS, Renderer, RendererParameters
 from flexsheet.nodes.renderer.object_surface import (
     ObjectSurface,
     VertexNormals,
@@ -431,6 +433,28 @@ async def test_without_solver_the_fingertip_draws_and_the_rate_is_limited(bench:
         bench.forward(1000 / 60)
         await bench.finger(0.0, 0.0, 0.1)
     assert 29 <= len(bench.sent) <= 31
+
+
+async def test_after_a_slow_frame_the_next_one_begins_once_messages_are_read(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Drawing takes 60 ms, which is longer than the period of 33 ms."""
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4))
+    draw = FrameRenderer.render
+
+    def draw_slowly(self: FrameRenderer, *given: Any, **options: Any) -> Any:
+        bench.forward(60)
+        return draw(self, *given, **options)
+
+    monkeypatch.setattr(FrameRenderer, "render", draw_slowly)
+    await bench.finger(0.0, 0.0, 0.1)
+    bench.forward(1e-6 * READ_TIME_NS - 0.5)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert len(bench.sent) == 1
+    bench.forward(1)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert len(bench.sent) == 2
 
 
 async def test_timer_keeps_the_image_alive_only_when_idle(bench: Bench) -> None:

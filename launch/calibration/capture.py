@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -44,16 +45,27 @@ The size is the length of the board's diagonal divided by the length of the imag
 """
 
 
+class BinGroup(StrEnum):
+    """The kinds of conditions; the first missing kind determines the hint to the user."""
+
+    TILT = "tilt"
+    DISTANCE = "distance"
+    LEFT_CELL = "cell of the left image"
+    RIGHT_CELL = "cell of the right image"
+    PAIRS = "pairs"
+
+
 @dataclass(frozen=True, slots=True)
 class Bin:
     """A condition, such as an image cell or a tilt, that a minimum number of image pairs must meet.
 
-    group: "left cell", "right cell", "tilt", "distance" or "pairs".
-    name: column and row of a cell, or name of a tilt or distance.
+    name: one of `TILTS` or `DISTANCES`; empty for other groups.
+    cell: column and row of an image cell; None for other groups.
     """
 
-    group: str
-    name: str
+    group: BinGroup
+    name: str = ""
+    cell: tuple[int, int] | None = None
 
 
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
@@ -64,15 +76,15 @@ def compute_required_counts(pairs: int) -> dict[Bin, int]:
     right image.
     """
     count = max(1, round(0.1 * pairs))
-    required = {Bin("pairs", ""): pairs}
+    required = {Bin(BinGroup.PAIRS): pairs}
     for row in range(ROWS):
         for column in range(COLUMNS):
             if column > 0:
-                required[Bin("left cell", f"{column},{row}")] = count
+                required[Bin(BinGroup.LEFT_CELL, cell=(column, row))] = count
             if column < COLUMNS - 1:
-                required[Bin("right cell", f"{column},{row}")] = count
-    required.update({Bin("tilt", name): count for name in TILTS})
-    required.update({Bin("distance", name): count for name in DISTANCES})
+                required[Bin(BinGroup.RIGHT_CELL, cell=(column, row))] = count
+    required.update({Bin(BinGroup.TILT, name): count for name in TILTS})
+    required.update({Bin(BinGroup.DISTANCE, name): count for name in DISTANCES})
     return required
 
 
@@ -158,15 +170,15 @@ class Capture:
     def _find_bins(self, pair: BoardPair) -> list[Bin]:
         """Return the conditions that an image pair meets."""
         pose = board_pose(pair.left, self._points, self._lens)
-        bins = [Bin("pairs", ""), Bin("tilt", classify_tilt(pose, self._middle))]
-        bins.append(Bin("distance", self._classify_distance(pose)))
-        for group, view in (("left cell", pair.left), ("right cell", pair.right)):
-            cell = np.floor(view.pixels / self._size * [COLUMNS, ROWS]).astype(int)
-            cell = np.clip(cell, 0, [COLUMNS - 1, ROWS - 1])
-            counts = Counter((int(column), int(row)) for column, row in cell)
+        bins = [Bin(BinGroup.PAIRS), Bin(BinGroup.TILT, classify_tilt(pose, self._middle))]
+        bins.append(Bin(BinGroup.DISTANCE, self._classify_distance(pose)))
+        for group, view in ((BinGroup.LEFT_CELL, pair.left), (BinGroup.RIGHT_CELL, pair.right)):
+            cells = np.floor(view.pixels / self._size * [COLUMNS, ROWS]).astype(int)
+            cells = np.clip(cells, 0, [COLUMNS - 1, ROWS - 1])
+            counts = Counter((int(column), int(row)) for column, row in cells)
             bins += [
-                Bin(group, f"{column},{row}")
-                for (column, row), corners in counts.items()
+                Bin(group, cell=cell)
+                for cell, corners in counts.items()
                 if corners >= MIN_CELL_CORNERS
             ]
         return bins
@@ -185,17 +197,16 @@ class Capture:
         missing = self.missing()
         if not missing:
             return prefix + "all required poses of the board are captured"
-        groups = {one.group: one for one in reversed(missing)}
-        first = next(
-            groups[name]
-            for name in ("tilt", "distance", "left cell", "right cell", "pairs")
-            if name in groups
-        )
+        first = min(missing, key=lambda one: list(BinGroup).index(one.group))
         return f"{prefix}show the board {describe_requirement(first)}"
 
 
 POSES = {
     "upright": "facing the camera",
+    "left side back": "with its left side tilted back",
+    "right side back": "with its right side tilted back",
+    "top back": "with its top tilted back",
+    "bottom back": "with its bottom tilted back",
     "near": "nearer",
     "middle": "at middle distance",
     "far": "further away",
@@ -205,12 +216,13 @@ POSES = {
 
 def describe_requirement(one: Bin) -> str:
     """Return a required pose of the board in words, such as "at the top left of the left image"."""
-    if not one.group.endswith("cell"):
-        return POSES.get(one.name, f"with its {one.name.replace(' back', ' tilted back')}")
-    column, row = (int(part) for part in one.name.split(","))
+    if one.cell is None:
+        return POSES[one.name]
+    column, row = one.cell
     height = ("top", "middle", "bottom")[row]
     across = ("left", "centre left", "centre right", "right")[column]
-    return f"at the {height} {across} of the {one.group.removesuffix(' cell')} image"
+    side = "left" if one.group is BinGroup.LEFT_CELL else "right"
+    return f"at the {height} {across} of the {side} image"
 
 
 def classify_tilt(pose: Floats, middle: Floats) -> str:

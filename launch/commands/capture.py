@@ -158,7 +158,14 @@ def coverage_view(capture: Capture, hint: str) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    from flexsheet.launch.calibration.capture import COLUMNS, DISTANCES, ROWS, TILTS, Bin
+    from flexsheet.launch.calibration.capture import (
+        COLUMNS,
+        DISTANCES,
+        ROWS,
+        TILTS,
+        Bin,
+        BinGroup,
+    )
 
     def cell(one: Bin) -> Text:
         count, required = capture.counts[one], capture.needed.get(one, 0)
@@ -168,12 +175,16 @@ def coverage_view(capture: Capture, hint: str) -> RenderableType:
         )
 
     tables = []
-    for side in ("left", "right"):
+    for side, images in (("left", BinGroup.LEFT_CELL), ("right", BinGroup.RIGHT_CELL)):
         cells = Table(title=f"{side} image", show_header=False)
         for row in range(ROWS):
-            cells.add_row(*(cell(Bin(f"{side} cell", f"{x},{row}")) for x in range(COLUMNS)))
+            cells.add_row(*(cell(Bin(images, cell=(x, row))) for x in range(COLUMNS)))
         tables.append(cells)
-    for group, names in (("tilt", TILTS), ("distance", DISTANCES), ("pairs", ("",))):
+    for group, names in (
+        (BinGroup.TILT, TILTS),
+        (BinGroup.DISTANCE, DISTANCES),
+        (BinGroup.PAIRS, ("",)),
+    ):
         table = Table(title=group, show_header=False)
         for name in names:
             table.add_row(name, cell(Bin(group, name)))

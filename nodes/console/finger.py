@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flexsheet.messages.base import Message
 from flexsheet.messages.types import FingerPath
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
@@ -86,7 +85,7 @@ class FingerController:
     viewer, nothing is published, and other programs can control the finger.
     """
 
-    def __init__(self, publish: Callable[[Message], None], *, speed_m_per_s: float) -> None:
+    def __init__(self, publish: Callable[[FingerPath], None], *, speed_m_per_s: float) -> None:
         self._publish, self._speed_m_per_s = publish, speed_m_per_s
         self._picker: SurfacePicker | None = None
         self._target: Floats | None = None

@@ -396,9 +396,8 @@ def limit_driver_threads() -> None:
     """Limit the threads of a software OpenGL driver to half of the cores.
 
     The other half remains free for other nodes. If there are at most two cores, the driver starts
-    no threads of its own. Without the limit, rendering on busy cores uses 50 % more processor time,
-    because threads wait for one another. If the environment variable LP_NUM_THREADS is set, its
-    value is used instead.
+    no threads of its own, because threads that wait for one another on busy cores use additional
+    processor time. If the environment variable LP_NUM_THREADS is set, its value is used instead.
     """
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
