@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 CALIBRATION_FILE = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 
-WRONG_FOOTED_M = 5e-3
+WRONG_MARKER_M = 5e-3
 """The error of a valid fingertip above which it belongs to another object, in metres."""
 
 

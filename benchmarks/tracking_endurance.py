@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.tracking_bench import (
-    WRONG_FOOTED_M,
+    WRONG_MARKER_M,
     Frame,
     ObservedFrame,
     Observer,
@@ -199,7 +199,7 @@ class Tally:
     jumps_mm: list[float] = field(default_factory=list)
     errors_mm: list[float] = field(default_factory=list)
     jumps: list[dict[str, Any]] = field(default_factory=list)
-    wrong_footed: list[dict[str, Any]] = field(default_factory=list)
+    wrong_markers: list[dict[str, Any]] = field(default_factory=list)
     outages: int = 0
     reacquired_ms: list[float] = field(default_factory=list)
     refused_in_full_view: int = 0
@@ -232,8 +232,8 @@ class Tally:
                 "p99": float(np.quantile(errors_mm, 0.99)),
                 "max": float(errors_mm.max()),
             },
-            "wrong_footed_frames": len(self.wrong_footed),
-            "wrong_footed": self.wrong_footed[:SHOWN],
+            "wrong_marker_frames": len(self.wrong_markers),
+            "wrong_markers": self.wrong_markers[:SHOWN],
             "outages": self.outages,
             "reacquired_ms": {
                 "median": float(np.median(again_ms)),
@@ -265,8 +265,8 @@ def evaluate_sequence(seen: list[ObservedFrame], scene: Scene, seed: int) -> Tal
         tally.valid += 1
         error_m = float(np.linalg.norm(one.error_m))
         tally.errors_mm.append(1e3 * error_m)
-        if error_m > WRONG_FOOTED_M:
-            tally.wrong_footed.append(
+        if error_m > WRONG_MARKER_M:
+            tally.wrong_markers.append(
                 {
                     "seed": seed,
                     "time_s": round(one.frame.time_s, 3),
@@ -346,7 +346,7 @@ def endure(frames: int, *, processes: int) -> Tally:
             total.add(tally)
             print(
                 f"\r{total.frames} of {frames} frames, {time.monotonic() - began_s:.0f} s, "
-                f"{len(total.wrong_footed)} wrong-footed",
+                f"{len(total.wrong_markers)} on a wrong marker",
                 end="",
                 file=sys.stderr,
                 flush=True,

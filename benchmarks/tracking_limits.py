@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks.tracking_bench import (
     CALIBRATION_FILE,
-    WRONG_FOOTED_M,
+    WRONG_MARKER_M,
     Frame,
     ObservedFrame,
     Observer,
@@ -418,7 +418,7 @@ def evaluate(
         p99_mm=float(np.quantile(errors_mm, 0.99)) if some else None,
         max_mm=float(errors_mm.max()) if some else None,
         worst_sigmas=max(sigmas(one, added) for one in valid) if some else None,
-        wrong=int((errors_mm > 1e3 * WRONG_FOOTED_M).sum()),
+        wrong=int((errors_mm > 1e3 * WRONG_MARKER_M).sum()),
         recovery_ms=(
             (float(np.median(recoveries_ms)), max(recoveries_ms)) if recoveries_ms else None
         ),

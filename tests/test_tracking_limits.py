@@ -123,7 +123,7 @@ def test_no_clutter_is_confused_with_the_finger(
     for seed, frames in sequences:
         seen, _ = asyncio.run(follow(seed, frames))
         tally = evaluate_sequence(seen, bench_scene(), seed)
-        assert tally.wrong_footed == []
+        assert tally.wrong_markers == []
         assert max(tally.jumps_mm) < 1.5
         assert tally.valid > 0.4 * frames
         assert tally.outages > 3
