@@ -1,23 +1,27 @@
 """Compare the rendered force of soft to stiff objects with the simulator's membrane.
 
-OPENBLAS_NUM_THREADS=1 python -m benchmarks.compliance
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.compliance [--json]
 
 The object of the scene is used with several Young's moduli. The force-depth curve is computed by
 the soft body. For each modulus, the planner selects the stretch and the advance of the sheet, and
 the simulated sheet gives the force on a finger at each depth. A sheet with stretch but without
 advance is measured for comparison.
 
-The program also prints the force errors at other points of the sheet, and the range of moduli that
-the sheet can render. It takes two minutes.
+The program also measures the force errors at other points of the sheet, and the range of moduli
+that the sheet can render. Errors are relative to the force of the object, or to 0.05 N if this is
+larger. It takes two minutes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import argparse
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.messaging import print_report
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
 from flexsheet.launch.health.compliance import (
     LINEAR_DEPTH_M,
@@ -32,7 +36,6 @@ from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
     TARGET_ERROR_RATIO,
     WEBER_RATIO,
-    WEBER_RATIO_BARE,
     ObjectCurve,
     choose_stretch,
     compute_force_uncertainty_ratio,
@@ -68,57 +71,59 @@ def errors(
     return error
 
 
-def row(name: str, values: Floats) -> str:
-    return f"{name:<28}" + "".join(f"{100 * value:>8.1f}" for value in values)
+def largest_percent(errors: Floats) -> float:
+    """Return the error with the largest absolute value, with its sign, in percent."""
+    return 100.0 * float(errors[np.abs(errors).argmax()])
 
 
-def describe_error(error: Floats) -> str:
-    worst = float(np.abs(error).max())
-    if worst <= TARGET_ERROR_RATIO:
-        return f"within {100 * TARGET_ERROR_RATIO:.0f} %"
-    if worst <= WEBER_RATIO:
-        return f"below the just noticeable difference ({100 * WEBER_RATIO:.0f} %)"
-    return f"noticeable ({100 * worst:.0f} %; {100 * WEBER_RATIO:.0f}-{100 * WEBER_RATIO_BARE:.0f})"
-
-
-def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
+def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> Iterator[dict[str, Any]]:
+    """Yield the force errors for each modulus of the object."""
     curve_of = object_curve(scene)
-    print(f"{'error, % of wanted, at':<28}" + "".join(f"{1e3 * d:>5.0f} mm" for d in depths))
     for modulus in MODULI_PA:
         curve = curve_of(modulus)
         wanted = curve.force_n(depths)
         shown = compute_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
         error = errors(scene, shown.stretch_ratio, shown.indentation_m(depths), wanted)
         stiffness = float(curve.force_n(np.array([LINEAR_DEPTH_M]))[0]) / LINEAR_DEPTH_M
-        old = choose_stretch(stiffness, scene.sheet)[0]
-        before = errors(scene, old, depths, wanted)
-        print(
-            f"{1e-3 * modulus:g} kPa, {stiffness:.0f} N/m: stretch {shown.stretch_ratio:.3f}, "
-            f"advance {shown.centre.advance_per_depth:.2f}, clamps "
-            f"{shown.centre.edge_force_n.max():.1f} N: {describe_error(error)}"
-        )
-        print("  wanted, N" + " " * 17 + "".join(f"{force:>8.3f}" for force in wanted))
-        retreat = 1e3 * shown.normal_offset_m(depths)
-        print("  retreat, mm" + " " * 15 + "".join(f"{one:>8.2f}" for one in retreat))
-        print(row("  stretch and retreat", error))
-        print(row(f"  stretch {old:.3f} alone", before))
-        if shown.note:
-            print(f"  {shown.note}")
+        stretch_alone = choose_stretch(stiffness, scene.sheet)[0]
+        yield {
+            "modulus_pa": round(modulus),
+            "stiffness_n_per_m": stiffness,
+            "stretch": shown.stretch_ratio,
+            "advance_per_depth": shown.centre.advance_per_depth,
+            "max_edge_force_n": float(shown.centre.edge_force_n.max()),
+            "max_percent": largest_percent(error),
+            "max_to_35_mm_percent": largest_percent(error[depths <= 0.035]),
+            "stretch_alone_max_percent": largest_percent(
+                errors(scene, stretch_alone, depths, wanted)
+            ),
+            "force_n": label_depths(depths, wanted),
+            "retreat_mm": label_depths(depths, 1e3 * shown.normal_offset_m(depths)),
+        }
 
 
-def places(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
+def label_depths(depths: Floats, values: Floats) -> dict[str, float]:
+    """Return values by depth, such as "2 mm"."""
+    return {f"{1e3 * d:g} mm": float(one) for d, one in zip(depths, values, strict=True)}
+
+
+def places(scene: Scene, law: SheetForceModel, depths: Floats) -> Iterator[dict[str, Any]]:
+    """Yield the force errors at several places of the sheet, in percent."""
     curve = object_curve(scene)(PLACES_MODULUS_PA)
     shown = compute_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
-    print(f"\n{1e-3 * PLACES_MODULUS_PA:g} kPa at places of the sheet, error %")
     for place in PLACES:
         pushed = shown.indentation_m(depths, place)
         error = errors(scene, shown.stretch_ratio, pushed, curve.force_n(depths), place)
-        where = f"  x {1e3 * place[0]:.0f}, y {1e3 * place[1]:.0f} mm"
-        print(row(where, error) + f"   {describe_error(error)}")
+        yield {
+            "modulus_pa": round(PLACES_MODULUS_PA),
+            "x_mm": 1e3 * place[0],
+            "y_mm": 1e3 * place[1],
+            "error_percent": label_depths(depths, 100.0 * error),
+        }
 
 
-def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
-    """Print the softest and the stiffest modulus that the force model allows."""
+def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> dict[str, float]:
+    """Return the softest and the stiffest modulus (Pa) that the force model allows."""
     curve_of = object_curve(scene)
 
     def fits(modulus: float) -> bool:
@@ -138,25 +143,25 @@ def limits(scene: Scene, law: SheetForceModel, max_depth_m: float) -> None:
             inside, outside = (middle, outside) if holds(middle) else (inside, middle)
         return inside
 
-    stiffest = border(fits, 1000.0, 1e6)
-    softest = border(sure, 4000.0, 10.0)
-    for name, modulus in (("softest", softest), ("stiffest", stiffest)):
-        stiffness = curve_of(modulus).force_n(np.array([LINEAR_DEPTH_M]))[0] / LINEAR_DEPTH_M
-        print(
-            f"{name} to {1e3 * max_depth_m:.0f} mm: {modulus:.0f} Pa, {stiffness:.0f} N/m at "
-            f"{1e3 * LINEAR_DEPTH_M:.0f} mm"
-        )
+    return {
+        "max_depth_mm": 1e3 * max_depth_m,
+        "softest_pa": border(sure, 4000.0, 10.0),
+        "stiffest_pa": border(fits, 1000.0, 1e6),
+    }
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
     scene = load_scene(SCENE_FILE)
     law = make_force_model(scene.sheet)
-    print(f"scene {scene.name}, law {law.name}; 0.05 N and more are compared")
-    materials(scene, law, DEPTHS_M)
-    places(scene, law, DEPTHS_M)
-    print()
-    for deepest in (0.010, 0.020, 0.050):
-        limits(scene, law, deepest)
+    report = {
+        "materials": [*materials(scene, law, DEPTHS_M)],
+        "places": [*places(scene, law, DEPTHS_M)],
+        "range": [limits(scene, law, max_depth_m) for max_depth_m in (0.010, 0.020, 0.050)],
+    }
+    print_report(report, *report, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -1,27 +1,29 @@
 """Compare the fingertip detection in a region of interest with that in full images.
 
-OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip [--json]
 
 Simulated images, 640x480, of a finger in front of the sheet with its hand and small glints ("lab"),
 at rest and at 1 m/s. Both methods process the same images in turn. OpenCV uses one thread, and the
 times are the processor time of that thread, so that other load has little effect. Prints median and
-99th percentile of the time per pair, their ratios, and the errors. The errors are compared with the
-Cramer-Rao bound of the same pixels and with the reported covariance (normalised mean square: 1 is
-exact).
+99th percentile of the time per pair, and the errors. The errors are compared with the Cramer-Rao
+bound of the same pixels and with the reported covariance (normalised mean square: 1 is exact).
 """
 
 from __future__ import annotations
 
+import argparse
 import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from benchmarks.fingertip_bound import fingertip_bound
+from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats, Image
@@ -120,12 +122,11 @@ def measure(scene: Scene, method: str, taken: list[TestShot]) -> tuple[Run, Run]
     return runs[0], runs[1]
 
 
-def report(method: str, name: str, run: Run, bound_m: float) -> None:
-    """Print one line of the table."""
+def evaluate(run: Run, bound_m: float) -> dict[str, Any]:
+    """Return the times (us) and the errors of a run, with the ratio to the bound (m)."""
     found = np.isfinite(run.errors_m[:, 0])
     errors_m = run.errors_m[found]
     rms_m = float(np.sqrt(np.mean(np.sum(errors_m**2, axis=1))))
-    worst_m = float(np.quantile(np.linalg.norm(errors_m, axis=1), 0.99))
     normalised = np.mean(
         [
             error @ np.linalg.solve(covariance, error)
@@ -133,21 +134,29 @@ def report(method: str, name: str, run: Run, bound_m: float) -> None:
         ]
     )
     median_s, p99_s = np.quantile(run.times_s, [0.5, 0.99])
-    print(
-        f"{method:18s} {name:7s} {1e6 * median_s:6.0f} {1e6 * p99_s:6.0f} us;"
-        f" found {found.sum():3d} of {len(found)}, {1e3 * rms_m:.3f} mm rms, {1e3 * worst_m:.3f} mm"
-        f" at 99 %, {rms_m / bound_m:5.2f} x bound, normalised {normalised / 3.0:.2f}",
-        flush=True,
-    )
+    return {
+        "p50_us": 1e6 * float(median_s),
+        "p99_us": 1e6 * float(p99_s),
+        "found": int(found.sum()),
+        "pairs": len(found),
+        "rms_mm": 1e3 * rms_m,
+        "p99_mm": 1e3 * float(np.quantile(np.linalg.norm(errors_m, axis=1), 0.99)),
+        "bound_ratio": rms_m / bound_m,
+        "normalised": float(normalised) / 3.0,
+    }
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    as_json = parser.parse_args().json
     cv2.setNumThreads(1)
     scene = load_scene(SCENE_FILE)
     exposure_s = scene.camera.exposure_s
     camera = TwinCamera(
         scene.camera, finger_radius_m=scene.finger.radius_m, seed=1, clutter=CLUTTER["lab"]
     )
+    rows = []
     for speed_m_per_s in SPEEDS_M_PER_S:
         taken = shots(camera, speed_m_per_s, exposure_s)
         bounds = [
@@ -157,16 +166,11 @@ def main() -> None:
             for shot in taken[:BOUNDS]
         ]
         bound_m = float(np.sqrt(np.mean([np.trace(bound.position_m2) for bound in bounds])))
-        print(f"\n{speed_m_per_s:g} m/s, bound {1e3 * bound_m:.3f} mm rms; p50, p99 a pair:")
         for method in MARKER_METHODS:
-            near, whole = measure(scene, method, taken)
-            report(method, "region", near, bound_m)
-            report(method, "whole", whole, bound_m)
-            ratios = [
-                float(np.quantile(whole.times_s, q) / np.quantile(near.times_s, q))
-                for q in (0.5, 0.99)
-            ]
-            print(f"{method:18s} whole over region: p50 {ratios[0]:.1f}, p99 {ratios[1]:.1f}")
+            for image, run in zip(("region", "whole"), measure(scene, method, taken), strict=True):
+                row = {"speed_m_per_s": speed_m_per_s, "method": method, "image": image}
+                rows.append(row | evaluate(run, bound_m))
+    print_rows(rows, as_json=as_json)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from flexsheet.nodes.node import PortCounts
 
 T = TypeVar("T")
 RING_VARIABLE = "FLEXSHEET_BENCHMARK_RING"
-WITHOUT, WITH = NODES_USE, "the same with keys"
+WITHOUT, WITH = NODES_USE, "flexsheet_keys"
 
 
 def listen(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:

@@ -845,9 +845,11 @@ def stroke_passes(scene: Scene) -> list[int]:
 def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) -> dict[str, Any]:
     """Return the counts as a dictionary for output."""
     names = sorted(set(tally.worst) | set(sheets.worst))
+    violations = {name: tally.violations[name] + sheets.violations[name] for name in names}
     return {
         "commands": tally.commands + sheets.commands,
-        "violations": {name: tally.violations[name] + sheets.violations[name] for name in names},
+        "violation_count": sum(violations.values()),
+        "violations": violations,
         "worst_ratio": {
             name: round(max(tally.worst[name], sheets.worst[name]), 4) for name in names
         },
@@ -900,7 +902,7 @@ def main() -> int:
     options = parser.parse_args()
     result = run(options.commands, options.seed)
     print(json.dumps(result, indent=1))
-    return 1 if any(result["violations"].values()) else 0
+    return 1 if result["violation_count"] else 0
 
 
 if __name__ == "__main__":

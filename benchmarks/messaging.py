@@ -46,9 +46,9 @@ from flexsheet.messages.types import Fingertip, StereoPair
 from flexsheet.messages.wire import INLINE_BYTES, count_bytes, decode, encode
 from flexsheet.nodes.node import PortCounts
 
-FLOOR = "blocking"
-ONE_PROCESS = "flexsheet, one process"
-NODES_USE = "flexsheet uvloop"
+REFERENCE = "blocking"
+ONE_PROCESS = "one_process"
+NODES_USE = "flexsheet_uvloop"
 EPOCH = 1
 
 
@@ -182,20 +182,18 @@ def flexsheet_uvloop(topic: Topic, endpoint: str, arrived: Callable[[int, int], 
 
 
 DESIGNS = (
-    Design(FLOOR, "raw, blocking recv in a separate thread: the floor", False, blocking),
+    Design(REFERENCE, "raw, blocking recv in a separate thread: the reference", False, blocking),
     Design("zmq.asyncio", "raw, await recv_multipart()", False, zmq_asyncio),
     Design("descriptor", "raw, add_reader on the socket's descriptor", False, descriptor),
-    Design("descriptor uvloop", "the same on uvloop", False, descriptor_uvloop),
+    Design("descriptor_uvloop", "the same on uvloop", False, descriptor_uvloop),
     Design(
-        "zmq.asyncio typed", "await recv_multipart(), decoded, validated", True, zmq_asyncio_typed
+        "zmq.asyncio_typed", "await recv_multipart(), decoded, validated", True, zmq_asyncio_typed
     ),
     Design(
-        "flexsheet asyncio", "flexsheet.messages.bus, decoded, validated", True, flexsheet_asyncio
+        "flexsheet_asyncio", "flexsheet.messages.bus, decoded, validated", True, flexsheet_asyncio
     ),
     Design(NODES_USE, "the same on uvloop: what nodes use", True, flexsheet_uvloop),
-    Design(
-        "flexsheet, all frames", "the same, each array its own frame", True, flexsheet_uvloop, 0
-    ),
+    Design("flexsheet_all_frames", "the same, each array its own frame", True, flexsheet_uvloop, 0),
 )
 
 
@@ -236,7 +234,7 @@ def stereo(number: int) -> StereoPair:
 
 PAYLOADS = (
     Payload("fingertip", TOPICS["fingertip"], 250.0, fingertip),
-    Payload("stereo pair 640x480", TOPICS["stereo"], 60.0, stereo),
+    Payload("stereo_640x480", TOPICS["stereo"], 60.0, stereo),
 )
 
 
@@ -452,7 +450,7 @@ def measure(
     seconds: float,
     open_sender: Callable[[Design, Payload, int], Sender | LocalSender],
     step: Callable[[], object],
-    reference: str = FLOOR,
+    reference: str = REFERENCE,
 ) -> list[dict[str, Any]]:
     """Return one row per design: medians over rounds of p50, p99 and their ratios to a reference.
 
@@ -479,12 +477,12 @@ def measure(
     finally:
         for sender in senders:
             sender.close()
-    floor = by_design[reference]
+    base_rounds = by_design[reference]
 
     def row(design: Design) -> dict[str, Any]:
         p50s, p99s = zip(*by_design[design.name], strict=True)
-        p50_ratios = [own / base for own, (base, _) in zip(p50s, floor, strict=True)]
-        p99_ratios = [own / base for own, (_, base) in zip(p99s, floor, strict=True)]
+        p50_ratios = [own / base for own, (base, _) in zip(p50s, base_rounds, strict=True)]
+        p99_ratios = [own / base for own, (_, base) in zip(p99s, base_rounds, strict=True)]
         median = np.nanmedian if np.isfinite(p50s).any() else np.median
         return {
             "payload": payload.name,

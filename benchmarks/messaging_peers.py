@@ -35,7 +35,16 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks import keys, messaging, peers
-from benchmarks.messaging import FLOOR, NODES_USE, PAYLOADS, BusLine, Design, Line, Payload, Sender
+from benchmarks.messaging import (
+    NODES_USE,
+    PAYLOADS,
+    REFERENCE,
+    BusLine,
+    Design,
+    Line,
+    Payload,
+    Sender,
+)
 from flexsheet.launch.methods.results import machine_name
 
 CLONE_NEWNET = 0x40000000
@@ -90,7 +99,7 @@ PEERS = (
     ),
     Peer(
         "cyclonedds",
-        Design("Cyclone DDS", "typed, reliable UDP", True, peers.receive_dds, open=peers.DdsLine),
+        Design("cyclone_dds", "typed, reliable UDP", True, peers.receive_dds, open=peers.DdsLine),
         dds_place,
     ),
     Peer(
@@ -103,7 +112,7 @@ PEERS = (
 
 OURS = Design(NODES_USE, "typed, validated", True, messaging.flexsheet_uvloop)
 OURS_KEYED = Design(NODES_USE, "typed, validated, CURVE", True, keys.listen)
-RAW = Design(FLOOR, "raw ZeroMQ: the floor", False, messaging.blocking)
+RAW = Design(REFERENCE, "raw ZeroMQ: the reference", False, messaging.blocking)
 
 
 def _libc(call: str, *arguments: int) -> None:
@@ -189,7 +198,7 @@ def measure_over(
                 "tcp": "tcp://127.0.0.1:*",
                 "veth": f"tcp://{ADDRESSES[0]}:*",
             }[over]
-            if design.name == FLOOR:
+            if design.name == REFERENCE:
                 return peers.ZmqLine(payload, place)
             if over == "veth":
                 return keys.KeyedLine(payload, place, ring, loop)

@@ -1,25 +1,27 @@
 """Measure the time of one step of the planner for every shape, and the maximum finger speed.
 
-OPENBLAS_NUM_THREADS=1 python -m benchmarks.planner [MESH METRES_PER_UNIT]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.planner [--mesh FILE METRES_PER_UNIT] [--json]
 
 A finger hovers, touches, strokes while it pushes, lifts, and moves behind the object, where the
 sheet stops. Each step of `SheetTrajectoryPlanner.follow_finger` is timed by phase, as the minimum
-over several repeats of the path. The table also contains the fraction of a tenth of the arms' 7.1
-ms cycle. The second table contains the maximum stroke speed along the object's smallest radius of
-curvature at which the sheet's normal stays within half a degree. Takes under three minutes.
+over several repeats of the path. The first table also contains the ratio of p99 to the target, a
+tenth of the arms' 7.1 ms cycle. The second table contains the maximum stroke speed along the
+object's smallest radius of curvature at which the sheet's normal stays within half a degree. Takes
+under three minutes.
 """
 
 from __future__ import annotations
 
+import argparse
 import copy
-import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.messaging import print_report
 from benchmarks.planner_methods import ellipsoid_mesh, sample_geodesic
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.plan import load_scene
@@ -41,23 +43,27 @@ PHASES = ("approach", "contact", "hold")
 SPEEDS_M_PER_S = np.geomspace(0.004, 0.2, 24)
 WAY_M = 0.016
 GOOD_DEG = 0.5
+AROUND, ALONG = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 
 
-def geometries() -> dict[str, Mapping[str, Any]]:
-    """Return geometries by name. The mesh represents an ellipsoid, unless a file is given."""
+def geometries(mesh: Sequence[str] | None) -> dict[str, Mapping[str, Any]]:
+    """Return geometries by name.
+
+    mesh: file and unit (m) of a further mesh, or None.
+    """
     named: dict[str, Mapping[str, Any]] = {
         "cylinder": {"shape": "cylinder", "radius_m": 0.0353553, "length_m": 0.12},
         "sphere": {"shape": "sphere", "radius_m": 0.05},
         "ellipsoid": {"shape": "ellipsoid", "semi_axes_m": (0.06, 0.04, 0.05)},
         "plane": {"shape": "plane", "width_m": 0.2, "height_m": 0.16},
-        "rounded box": {
+        "rounded_box": {
             "shape": "rounded_box",
             "size_m": (0.1, 0.08, 0.06),
             "edge_radius_m": 0.02,
         },
     }
     vertices, triangles = ellipsoid_mesh(4)
-    named["ellipsoid's mesh"] = dict(
+    named["ellipsoid_mesh"] = dict(
         Mesh(
             vertices_m=vertices,
             triangles=triangles.astype(np.int32),
@@ -67,8 +73,9 @@ def geometries() -> dict[str, Mapping[str, Any]]:
     )
     organ = load_scene(SCENE_FILE.with_name("organ.yaml")).object.geometry
     named["organ"] = dict(organ)
-    if len(sys.argv) == 3:
-        named[Path(sys.argv[1]).stem] = dict(read_mesh(Path(sys.argv[1]), float(sys.argv[2]), None))
+    if mesh is not None:
+        path, metres_per_unit = Path(mesh[0]), float(mesh[1])
+        named[path.stem] = dict(read_mesh(path, metres_per_unit, None))
     return named
 
 
@@ -133,19 +140,23 @@ def follow(
 
 def time_steps(
     name: str, plan: SheetTrajectoryPlanner, shape: Shape, compliance: ComplianceController
-) -> None:
+) -> dict[str, Any]:
+    """Return the times of one step in ms, by phase and in total."""
     fingers = make_session(shape)
     times = np.full(len(fingers), np.inf)
     for _ in range(REPEATS):
         steps = list(follow(copy_planner(plan), fingers, compliance))
         times = np.minimum(times, [took for took, _ in steps])
     phases = np.array([planned.command.phase for _, planned in steps])
-    cells = []
+    row: dict[str, Any] = {"shape": name}
     for phase in PHASES:
         some = 1e3 * times[phases == phase]
-        cells.append(f"{np.median(some):.2f} / {np.quantile(some, 0.99):.2f}" if len(some) else "–")
+        row[f"{phase}_ms"] = {
+            f"p{percent}": float(np.percentile(some, percent)) if len(some) else None
+            for percent in (50, 99)
+        }
     p99 = float(np.quantile(times, 0.99))
-    print(f"| {name} | {' | '.join(cells)} | {1e3 * p99:.2f} | {p99 / (0.1 * CYCLE_S):.0%} |")
+    return row | {"p99_ms": 1e3 * p99, "fraction_of_target": p99 / (0.1 * CYCLE_S)}
 
 
 def normal_error_deg(
@@ -180,32 +191,41 @@ def normal_error_deg(
     )
 
 
+def find_peak_speed_mm_per_s(
+    plan: SheetTrajectoryPlanner, shape: Shape, heading: Floats, compliance: ComplianceController
+) -> float:
+    """Return the maximum speed of `SPEEDS_M_PER_S` up to which the normal is exact, or 0."""
+    good = 0.0
+    for speed in SPEEDS_M_PER_S:
+        if normal_error_deg(plan, shape, heading, speed, compliance) > GOOD_DEG:
+            break
+        good = float(speed)
+    return 1e3 * good
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--mesh", nargs=2, metavar=("FILE", "METRES_PER_UNIT"))
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
     scene = load_scene(SCENE_FILE)
     compliance = make_compliance(scene)
     shapes = {
         name: (make_planner(scene, geometry), make_shape(geometry))
-        for name, geometry in geometries().items()
+        for name, geometry in geometries(options.mesh).items()
     }
-    print("One step, p50 / p99 in ms\n")
-    print(f"| shape | {' | '.join(PHASES)} | p99 of all | of a tenth of the arms' cycle |")
-    print("|" + "---|" * (len(PHASES) + 3))
-    for name, (plan, shape) in shapes.items():
-        time_steps(name, plan, shape, compliance)
-    print("\nStrokes of 16 mm: peak speed to which the normal is within 0.5°\n")
-    print("| shape | around, mm/s | along, mm/s |")
-    print("|---|---|---|")
-    for name, (plan, shape) in shapes.items():
-        cells = []
-        for heading in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
-            good = 0.0
-            for speed in SPEEDS_M_PER_S:
-                if normal_error_deg(plan, shape, heading, speed, compliance) > GOOD_DEG:
-                    break
-                good = float(speed)
-            most = "≥ " if good == SPEEDS_M_PER_S[-1] else ""
-            cells.append(f"{most}{1e3 * good:.0f}")
-        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    report = {
+        "steps": [time_steps(name, *pair, compliance) for name, pair in shapes.items()],
+        "peak_speeds": [
+            {
+                "shape": name,
+                "around_mm_per_s": find_peak_speed_mm_per_s(*pair, AROUND, compliance),
+                "along_mm_per_s": find_peak_speed_mm_per_s(*pair, ALONG, compliance),
+            }
+            for name, pair in shapes.items()
+        ],
+    }
+    print_report(report, "steps", "peak_speeds", as_json=options.json)
 
 
 if __name__ == "__main__":

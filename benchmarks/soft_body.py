@@ -1,20 +1,22 @@
-"""Measure how smooth and how fast the soft body is: slide a fingertip over meshes of several
-spacings.
+"""Measure how smooth and how fast the soft body is, by a fingertip that slides over its skin.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body [--table]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body [--table [--cold]] [--json]
 
-With --table, the nonlinear table of the demo's mesh is measured instead: the time to compute it
-(minutes, if it is not cached), its error and the linear method's against Newton solutions on finer
-meshes at points that it was not computed from, and the same slides. First the errors of the force
-are printed for all methods, against the stored force of an independent solver.
+Without --table, linear bodies with several spacings of the skin are measured. With --table, the
+nonlinear table of the demo's cylinder is measured: the errors of its force and of the forces of the
+other methods against the stored force of an independent solver; its errors and those of the linear
+method against Newton solutions on finer meshes, at points that it was not computed from; and the
+same slides. With --cold, the table is first computed without a cache, which takes minutes, and then
+read from the cache, to measure both times.
 
-The fingertip moves 6 mm in each of three directions at constant depth, 0.02 mm per step. Prints for
-every mesh and depth the force (beside Hertz's), its ripple, the largest jump of any skin node in a
-step, the stiffness, and the time of a step. Takes about a minute and 1.5 GiB.
+The fingertip moves 6 mm in each of three directions at constant depth, 0.02 mm per step. The result
+contains for every mesh and depth the mean force (beside Hertz's), its range, the largest jump of
+any skin node in a step, the stiffness, and the time of a step. Takes about a minute and 1.5 GiB.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import resource
 import sys
@@ -23,9 +25,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.messaging import print_report
 from flexsheet.launch.experiments.compliance import POSITIONS_M
 from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
@@ -77,37 +81,54 @@ def places(heading_rad: float) -> Iterator[tuple[float, float]]:
         yield FROM_M[0] + way * np.cos(heading_rad), FROM_M[1] + way * np.sin(heading_rad)
 
 
-def evaluate_table(scene: Scene, spacing_m: float) -> None:
-    """Print the error of a table relative to Newton solutions, and results of slides."""
+def evaluate_table(scene: Scene, spacing_m: float, *, cold: bool) -> dict[str, Any]:
+    """Return the errors of a table, and results of slides.
+
+    cold: whether the table is computed in a new folder first, without a cache.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        cache_dir = Path(folder) if cold else default_cache_dir()
+        times_s = []
+        for _ in range(2 if cold else 1):
+            start = time.perf_counter()
+            best, linear = load_bodies(scene, spacing_m, cache_dir)
+            times_s.append(time.perf_counter() - start)
+    report: dict[str, Any] = {"skin_nodes": len(best.rest)}
+    if cold:
+        report["ready_s"] = dict(zip(("cold", "warm"), times_s, strict=True))
+    if isinstance(best.method, TableSoftBody):
+        levels = np.quantile(best.method.reach_m, [0.0, 0.1, 0.5])
+        names = ("all", "nine_in_ten", "half")
+        report["reach_mm"] = dict(zip(names, (1e3 * levels).tolist(), strict=True))
+    report["force_errors"] = find_force_errors(
+        scene, {"linear": linear, "quick": make_quick(scene, linear), "table": best}
+    )
+    mesh, radius_m = build_mesh(best.spec.mesh), require_cylinder(scene).radius_m
+    report["pushes"] = []
+    for along, angle in JUDGED_AT:
+        normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+        sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
+        report["pushes"] += evaluate_push(scene, mesh, sample, best, linear)
+    report["slides"] = [evaluate_slides(scene, best, radius_m, depth_m) for depth_m in DEPTHS_M]
+    return report
+
+
+def load_bodies(
+    scene: Scene, spacing_m: float, cache_dir: Path
+) -> tuple[body.SceneBody, body.SceneBody]:
+    """Return the nonlinear and the linear body, computed or read from a cache."""
     maker = SoftBodyFactory(
         skin_spacing_m=spacing_m,
         linear_depth_m=0.006,
         max_depth_m=0.010,
         friction_ratio=0.0,
-        cache_dir=default_cache_dir(),
+        cache_dir=cache_dir,
         workers=0,
     )
-    start = time.perf_counter()
     bodies = maker.bodies(scene, "auto", lambda *_: None)
     if len(bodies) == 1:
         bodies.insert(0, maker.build_table(scene, bodies[0], print_progress))
-    best, linear = bodies
-    print(f"ready after {time.perf_counter() - start:.1f} s, {len(best.rest)} skin nodes")
-    if isinstance(best.method, TableSoftBody):
-        least, tenth, half = 1e3 * np.quantile(best.method.reach_m, [0.0, 0.1, 0.5])
-        deep = int((best.method.reach_m >= 0.02 - 1e-9).sum())
-        print(
-            f"{len(best.method.reach_m)} places reach {least:.1f} mm at least, nine in ten "
-            f"{tenth:.1f} mm, half {half:.1f} mm; {deep} reach 20 mm"
-        )
-    print_force_errors(scene, {"linear": linear, "quick": make_quick(scene, linear), "table": best})
-    mesh, radius_m = build_mesh(best.spec.mesh), require_cylinder(scene).radius_m
-    for along, angle in JUDGED_AT:
-        normal = np.array([0.0, np.sin(angle), np.cos(angle)])
-        sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
-        evaluate_push(scene, mesh, sample, best, linear)
-    for depth_m in DEPTHS_M:
-        print_slides(scene, slide(best, radius_m, depth_m), depth_m)
+    return bodies[0], bodies[1]
 
 
 def make_quick(scene: Scene, linear: body.SceneBody) -> body.SceneBody:
@@ -127,8 +148,8 @@ def make_quick(scene: Scene, linear: body.SceneBody) -> body.SceneBody:
     return made[0]
 
 
-def print_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> None:
-    """Print the relative error of the force of each method by depth, in percent.
+def find_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> list[dict[str, Any]]:
+    """Return the relative error of the force of each method by depth, in percent.
 
     The reference is the stored force of an independent solver at three positions. At random points,
     the references are the force at the first position, and the force by the last method.
@@ -149,20 +170,20 @@ def print_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> No
         for name, one in bodies.items()
     }
     best_n = [*forces.values()][-1][1]
-    print("depth [mm]:", *(f"{1e3 * depth:g}" for depth in JUDGED_M))
+    rows = []
     for name, (at_positions, at_points) in forces.items():
-        rows = {
-            "at the reference's positions, from": (at_positions / stored - 1.0).min(axis=0),
-            "at the reference's positions, to": (at_positions / stored - 1.0).max(axis=0),
-            "at random points, 95 %": np.quantile(
-                np.abs(at_points / stored[0] - 1.0), 0.95, axis=0
-            ),
-            "from the last method, 95 %": np.quantile(
-                np.abs(at_points / best_n - 1.0), 0.95, axis=0
-            ),
+        ratios = {
+            "min_percent": (at_positions / stored - 1.0).min(axis=0),
+            "max_percent": (at_positions / stored - 1.0).max(axis=0),
+            "random_p95_percent": np.quantile(np.abs(at_points / stored[0] - 1.0), 0.95, axis=0),
+            "from_table_p95_percent": np.quantile(np.abs(at_points / best_n - 1.0), 0.95, axis=0),
         }
-        for label, row in rows.items():
-            print(f"{name}, {label}:", *(f"{100.0 * ratio:.1f}" for ratio in row))
+        rows += [
+            {"method": name, "depth_mm": round(1e3 * depth, 3)}
+            | {label: 100.0 * float(values[at]) for label, values in ratios.items()}
+            for at, depth in enumerate(JUDGED_M)
+        ]
+    return rows
 
 
 def normal_forces(
@@ -190,8 +211,8 @@ def evaluate_push(
     sample: snapshots.SamplePoint,
     best: body.SceneBody,
     linear: body.SceneBody,
-) -> None:
-    """Print the maximum error away from the finger and the force error, by depth."""
+) -> Iterator[dict[str, Any]]:
+    """Yield the maximum error away from the finger and the force error, by depth and method."""
     job = snapshots.make_snapshot_job(
         best.spec.mesh,
         mesh,
@@ -203,21 +224,22 @@ def evaluate_push(
     solved = snapshots.solve_snapshot(job)
     nodes, weights = SurfaceLocator(solved.rest, solved.faces).weights(best.rest)
     away = np.linalg.norm(best.rest - sample.point, axis=1) > 1.5 * scene.finger.radius_m
-    print(f"\nagainst Newton at {1e3 * sample.point[0]:.0f} mm, normal {sample.normal.round(2)}:")
     for level in range(solved.reached):
         depth_m = float(solved.depths_m[level])
         wanted = np.einsum("qa,qai->qi", weights, solved.moved[level][nodes])
         modulus = require_material(scene).young_modulus_pa
         force_n = modulus * float(solved.force_n[level] @ sample.normal)
-        texts = []
-        for one in (best, linear):
+        for name, one in (("table", best), ("linear", linear)):
             answer = one.method.respond(ContactQuery(sample.point, sample.normal, depth_m))
             error = np.linalg.norm(answer.displacement - wanted, axis=1)
-            texts.append(
-                f"{one.method.name} {1e3 * error[away].max():.3f} mm,"
-                f" force {100 * (answer.force_n @ sample.normal / force_n - 1):+.1f} %"
-            )
-        print(f"{1e3 * depth_m:5.1f} mm: {'; '.join(texts)}")
+            yield {
+                "x_mm": round(1e3 * float(sample.point[0])),
+                "depth_mm": round(1e3 * depth_m, 3),
+                "method": name,
+                "skin_error_mm": 1e3 * float(error[away].max()),
+                "force_error_percent": 100.0
+                * float(answer.force_n @ sample.normal / force_n - 1.0),
+            }
 
 
 def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
@@ -250,8 +272,8 @@ def hertz_force_n(scene: Scene, depth_m: float) -> float:
     return float(4.0 / 3.0 * modulus / (1.0 - nu**2) * np.sqrt(radius) * depth_m**1.5)
 
 
-def measure(scene: Scene, spacing_m: float) -> None:
-    """Print the time to precompute one mesh without and with a cache, and results of slides."""
+def measure(scene: Scene, spacing_m: float) -> dict[str, Any]:
+    """Return the time to compute one mesh without and with a cache, and results of slides."""
     spec = body.make_soft_body_spec(scene, spacing_m)
     if spacing_m == min(SPACINGS_M):
         mesh = replace(spec.mesh, touch_angle_rad=MIN_TOUCH_ANGLE_RAD)
@@ -261,39 +283,53 @@ def measure(scene: Scene, spacing_m: float) -> None:
         for _ in range(2):
             model = precompute.load_or_compute(spec, Path(folder), lambda *_: None)
             times.append(time.perf_counter())
-    cold_s, warm_s = np.diff(times)
+    cold_s, warm_s = np.diff(times).tolist()
     built = body.build_scene_body(scene, spec, model, linear_depth_m=0.006, max_depth_m=0.010)
-    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
-    print(
-        f"\n{1e3 * spacing_m:g} mm: {len(model.response.rest)} skin nodes,"
-        f" {len(model.response.contact_nodes)} loads, cold {cold_s:.1f} s, warm {warm_s:.2f} s,"
-        f" peak {peak_mib:.0f} MiB",
-        flush=True,
-    )
-    for depth_m in DEPTHS_M:
-        print_slides(scene, slide(built, require_cylinder(scene).radius_m, depth_m), depth_m)
+    radius_m = require_cylinder(scene).radius_m
+    return {
+        "spacing_mm": 1e3 * spacing_m,
+        "skin_nodes": len(model.response.rest),
+        "contact_nodes": len(model.response.contact_nodes),
+        "ready_s": {"cold": cold_s, "warm": warm_s},
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10,
+        "slides": [evaluate_slides(scene, built, radius_m, depth_m) for depth_m in DEPTHS_M],
+    }
 
 
-def print_slides(scene: Scene, slides: Slides, depth_m: float) -> None:
-    mean_n, stiffness = slides.force_n.mean(), slides.stiffness_n_per_m
+def evaluate_slides(
+    scene: Scene, built: body.SceneBody, radius_m: float, depth_m: float
+) -> dict[str, Any]:
+    """Slide at one depth in all directions, and return forces, jumps and times."""
+    slides = slide(built, radius_m, depth_m)
+    mean_n = float(slides.force_n.mean())
     median_s, p99_s = np.quantile(slides.step_s, [0.5, 0.99])
-    print(
-        f"{1e3 * depth_m:5.1f} mm: force {1e3 * mean_n:7.1f} mN"
-        f" (Hertz {1e3 * hertz_force_n(scene, depth_m):6.1f}),"
-        f" ripple +-{50 * np.ptp(slides.force_n) / mean_n:4.1f} %,"
-        f" jump {1e3 * slides.jump_m:.3f} mm, stiffness {stiffness.mean():.1f} N/m,"
-        f" step {1e6 * median_s:.0f} / {1e6 * p99_s:.0f} us",
-        flush=True,
-    )
+    return {
+        "skin_nodes": len(built.rest),
+        "depth_mm": round(1e3 * depth_m, 3),
+        "force_mn": 1e3 * mean_n,
+        "hertz_force_mn": 1e3 * hertz_force_n(scene, depth_m),
+        "force_range_percent": 100.0 * float(np.ptp(slides.force_n)) / mean_n,
+        "max_jump_mm": 1e3 * slides.jump_m,
+        "stiffness_n_per_m": float(slides.stiffness_n_per_m.mean()),
+        "step_p50_us": 1e6 * float(median_s),
+        "step_p99_us": 1e6 * float(p99_s),
+    }
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--table", action="store_true", help="measure the nonlinear table")
+    parser.add_argument("--cold", action="store_true", help="measure the time without a cache")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
     scene = load_scene(SCENE_FILE)
-    if "--table" in sys.argv[1:]:
-        evaluate_table(scene, DEMO_SPACING_M)
+    if options.table:
+        report = evaluate_table(scene, DEMO_SPACING_M, cold=options.cold)
+        print_report(report, "force_errors", "pushes", "slides", as_json=options.json)
         return
-    for spacing_m in SPACINGS_M:
-        measure(scene, spacing_m)
+    meshes = [measure(scene, spacing_m) for spacing_m in SPACINGS_M]
+    slides = [row for mesh in meshes for row in mesh.pop("slides")]
+    print_report({"meshes": meshes, "slides": slides}, "meshes", "slides", as_json=options.json)
 
 
 if __name__ == "__main__":

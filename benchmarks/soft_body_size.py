@@ -4,10 +4,10 @@ OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_size [--output docs/charts
 
 Bodies of 500 to 20,000 skin nodes respond to fingers at random points and to slowly moving ones.
 The geometry is the demo's cylinder with a suitable mesh, and the steps are those of the node. The
-tables contain random numbers, and rows for as many nodes as fit into `TABLE_BYTES`.
-Solving for 20,000 nodes would take hours, and 10,000 contact nodes some 100 GB with the nonlinear
-table. The memory of a full table is printed as well. The floor is this machine's current time to
-read the same number of bytes, by a dot product.
+tables contain random numbers, and rows for as many nodes as fit into `TABLE_BYTES`. Solving for
+20,000 nodes would take hours, and 10,000 contact nodes some 100 GB with the nonlinear table. The
+memory of a full table is printed as well. The reference is this machine's current time to read the
+same number of bytes, by a dot product.
 
 Writes soft-body-size.svg and soft-body-size.json. Takes a minute and 3 GB. With --redraw, only the
 plot is drawn again from the numbers in the folder.
@@ -51,7 +51,7 @@ CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
 LINEAR_RANGE_M = (0.012, 0.018)
 """The finger radius, larger than the method's range so that the contact grows with the depth."""
 TABLE_BYTES, MAX_PLACES = 400_000_000, 800
-FLOOR_BYTES = 400_000_000
+REFERENCE_BYTES = 400_000_000
 STEPS = 600
 SLOW_STEP_M = 2e-5
 ROWS_PER_ANSWER = 6 * 4
@@ -62,7 +62,7 @@ ROWS_PER_ANSWER = 6 * 4
 class Point:
     """A measurement with median and 99th percentile of times, s, at random points and on a slide.
 
-    floor_s: time to read `read_bytes` from random positions in memory.
+    memory_read_s: time to read `read_bytes` from random positions in memory.
     """
 
     method: str
@@ -74,7 +74,7 @@ class Point:
     random_p99_s: float
     slow_s: float
     slow_p99_s: float
-    floor_s: float
+    memory_read_s: float
     whole_table_bytes: int
 
 
@@ -131,9 +131,9 @@ def make_synthetic_body(
     return Synthetic(mesh, response, shape, centre, half)
 
 
-def floor_s(read_bytes: float) -> float:
+def memory_read_s(read_bytes: float) -> float:
     """Return the median time to read this many bytes from random positions in memory, s."""
-    source, rng = np.ones(FLOOR_BYTES // 4, dtype=np.float32), np.random.default_rng(1)
+    source, rng = np.ones(REFERENCE_BYTES // 4, dtype=np.float32), np.random.default_rng(1)
     count = max(16, int(read_bytes / 4))
     durations = []
     for start in rng.integers(0, len(source) - count, 60):
@@ -251,7 +251,7 @@ def measured(
         random_p99_s=float(np.quantile(at_random, 0.99)),
         slow_s=float(np.median(slowly)),
         slow_p99_s=float(np.quantile(slowly, 0.99)),
-        floor_s=floor_s(read),
+        memory_read_s=memory_read_s(read),
         whole_table_bytes=whole_table_bytes,
     )
 
@@ -276,10 +276,10 @@ def draw(by_size: Sequence[Point], by_contact: Sequence[Point], path: Path) -> N
                 ("random_p99_s", "random places, p99", "v:"),
                 ("slow_s", "slow slide", "s--"),
                 ("slow_p99_s", "slow slide, p99", "^:"),
-                ("floor_s", "floor: reading as much", "_-."),
+                ("memory_read_s", "reading as much memory", "_-."),
             ):
                 shown = [1e6 * getattr(point, name) for point in mine]
-                light = 0.5 if name == "floor_s" else 1.0
+                light = 0.5 if name == "memory_read_s" else 1.0
                 axes.plot(at, shown, style, color=color, alpha=light, label=f"{method}, {what}")
         mine = [point for point in by_size if point.method == method]
         at = [point.skin_nodes for point in mine]
