@@ -228,9 +228,9 @@ class _Arms:
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Publish an e-stop at once, and return the result and its duration.
+        """Publish an e-stop at once, and return the outcome and the duration of the attempt.
 
-        The topic is latched, so subscribers that connect later also receive the e-stop.
+        The topic `estop` is latched, so subscribers that connect later also receive the e-stop.
         """
         from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
@@ -247,7 +247,10 @@ class _Arms:
         return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Wait until `done` returns True for the recent arm states; return False on a timeout."""
+        """Wait until `done` returns True for the recent states of the arms.
+
+        Returns False if this does not happen before the timeout.
+        """
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
             ages_s = {side: now_s - received_s for side, received_s in self._received_s.items()}
@@ -268,7 +271,7 @@ def _command(
 
     Returns the exit code.
 
-    command: topic and message to publish; None: nothing is published.
+    command: topic and message to publish. If it is None, nothing is published.
     done: function that receives the arm states, and returns True when the command has had its
         effect.
     """

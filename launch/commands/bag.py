@@ -408,7 +408,10 @@ def plot(
 
 
 def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
-    """Print the number of exported messages by topic or channel, and list the unreadable topics."""
+    """Print the number of exported messages of each topic or channel.
+
+    Topics that cannot be read are also listed.
+    """
     if result.unreadable:
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
@@ -496,7 +499,8 @@ async def _record(
 ) -> int:
     """Record topics of the running graph in this process, and return the exit code 0.
 
-    given: parameters of the recorder.
+    given: values of the recorder's parameters.
+    seconds: duration of the recording. If it is None, the duration is not limited.
     """
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file

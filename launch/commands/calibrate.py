@@ -392,9 +392,11 @@ def make_provenance() -> dict[str, Any]:
 
 
 def write_scene_values(scene_file: Path, values: Mapping[str, Any], copy: Path) -> None:
-    """Write a copy of a scene file with other values; preserve comments and layout.
+    """Write a copy of a scene file in which some values are replaced.
 
-    values: new values by the dotted path of the key.
+    Comments and layout are preserved.
+
+    values: new values. Each key is the dotted path of the value in the scene file.
 
     Raises BadInputError if the changed scene is invalid.
     """
@@ -416,9 +418,9 @@ def write_scene_values(scene_file: Path, values: Mapping[str, Any], copy: Path) 
 
 
 def pose_values(key: str, pose: Pose) -> dict[str, Any]:
-    """Return the position and the angles of a pose by their dotted paths in a scene file.
+    """Return the position and the angles of a pose as new values for a scene file.
 
-    key: dotted path of the pose.
+    key: dotted path of the pose in the scene file. The keys of the result begin with this path.
     """
     return {
         f"{key}.position_m": [round_digits(one) for one in pose.position_m],
@@ -453,10 +455,11 @@ def require_twin(apparatus: str | None, *, simulated: bool) -> None:
 def load_true_devices(
     text: str | None, scene: Scene, scene_file: Path | None = None
 ) -> Apparatus | None:
-    """Load the apparatus: the true parameters of the simulated hardware.
+    """Load the true parameters of the simulated hardware (the apparatus).
 
-    The parameters refer to the world frame of the stereo camera, as all calibrations do. If `text`
-    is None, the result is None.
+    The poses refer to the world frame of the stereo camera, as they do in all calibrations.
+
+    text: apparatus file, or a random sample such as "seed:7". If it is None, the result is None.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.nodes.twin.truth import align_world_to_camera

@@ -70,9 +70,9 @@ def list_topics(
 ) -> None:
     """List the topics that have a writer or a reader in the running graph.
 
-    Without a running graph, all defined topics are listed. The expected rate is a fixed range for
-    health checks, or "on change" for a topic without one. `flexsheet topic hz TOPIC` measures the
-    rate in the running graph.
+    If no graph is running, all defined topics are listed. The expected rate is the range of rates
+    that health checks accept, or "on change" if the topic has no such range. `flexsheet topic hz
+    TOPIC` measures the rate in the running graph.
     """
     from flexsheet.messages.topics import TOPICS
 
@@ -310,7 +310,7 @@ def _by_writer(arrivals: Sequence[Arrival]) -> list[list[Arrival]]:
 
 
 def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the rate, lost messages and publication intervals (ms), with one row per writer."""
+    """Return one row per writer with the rate, lost messages and publication intervals (ms)."""
     import numpy as np
 
     rows = []
@@ -333,7 +333,7 @@ def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the bandwidth (bytes per second) and the message sizes, with one row per writer."""
+    """Return one row per writer with the bandwidth (bytes per second) and the message sizes."""
     rows = []
     for own in _by_writer(arrivals):
         sizes = [one.size_bytes for one in own]
@@ -352,7 +352,7 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return statistics of the age (ms) of the data at arrival, with one row per writer."""
+    """Return one row per writer with statistics of the age (ms) of the data at arrival."""
     rows = []
     for own in _by_writer(arrivals):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]

@@ -82,8 +82,8 @@ def tune(
     This takes seconds to minutes. Then the command predicts the errors of combined methods, and
     tests the fastest promising configuration in a graph. A configuration is accepted if it meets
     all tolerances, including the tolerances of latency and force. If --family is given, the command
-    chooses only the methods of these families, and chooses each one separately. Nodes use the
-    chosen method if their parameter is `auto`. The exit code is 3 if a tolerance is not met.
+    chooses methods only for these families, and treats each family separately. Nodes use the chosen
+    method if their parameter is `auto`. The exit code is 3 if a tolerance is not met.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune

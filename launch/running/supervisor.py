@@ -257,7 +257,8 @@ class Child:
     def _reap(self) -> None:
         """Handle the exit of the process.
 
-        Its child processes are killed, the last output is read, and the pipes are closed.
+        The child processes of this process are killed, its last output is read, and its pipes are
+        closed.
         """
         if self.exited.done():
             return
@@ -314,7 +315,8 @@ def _start_python(
 class RunningGraph:
     """A supervisor of the processes that run the nodes of a graph.
 
-    host: host of the nodes to start; None: the nodes of all hosts are started on this computer.
+    host: host of the nodes to start. If it is None, the nodes of all hosts are started on this
+        computer.
     without: names of nodes that are not started.
     report: function that is called with (node, line) for every log line. The folder `run.logs` also
         contains all lines.
@@ -452,7 +454,7 @@ class RunningGraph:
     def _send(self, number: int, children: Collection[Child]) -> None:
         """Send a signal to processes.
 
-        If the signal is SIGKILL, bags that may become incomplete are reported first.
+        If the signal is SIGKILL, bags that can become incomplete are reported first.
         """
         for bag in self._list_open_bags(children) if number == signal.SIGKILL else ():
             self._report(
@@ -575,9 +577,8 @@ class RunningGraph:
         return source_ns
 
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
-        """Publish a message that later subscribers also receive.
-
-        Return the source timestamp (ns) of the message.
+        """Publish a message that later subscribers also receive, and return its source timestamp
+        (ns).
 
         Returns None if there is no message, or if the launcher is not a writer of the topic.
         """
@@ -832,7 +833,7 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the scene file as JSON.
+        """Write each scene that is in the folder of the graph's scene file to `folder`, as JSON.
 
         Nodes that publish scenes read these files.
         """
