@@ -36,7 +36,7 @@ class Ros2Bridge:
     """A bridge between one running graph and one participant of DDS, the middleware of ROS 2.
 
     topics: flexsheet topics to publish.
-    accept: topics to accept from ROS nodes (keys of `INPUTS`).
+    accept: flexsheet topics for which messages of ROS nodes are accepted (keys of `INPUTS`).
     noise_m: standard deviation of external fingertip positions.
     published, accepted: numbers of messages by topic.
     on_problem: function that is called with the text of an error.

@@ -45,8 +45,8 @@ def mangle_type(name: str) -> str:
 def make_configuration(interface: str) -> str:
     """Return the XML configuration of Cyclone DDS for one network interface.
 
-    For the loopback interface, multicast is disabled. Raises Ros2Error if this computer has no such
-    interface.
+    If the interface is the loopback interface, multicast is disabled. Raises Ros2Error if this
+    computer has no such interface.
     """
     if interface not in psutil.net_if_addrs():
         names = ", ".join(sorted(psutil.net_if_addrs()))
@@ -224,8 +224,9 @@ class RosParticipant:
 def _make_qos(topic: RosTopic) -> Any:
     """Return the DDS quality of service: reliable, and transient local if the topic is latched.
 
-    A reliable writer is compatible with reliable and with best-effort readers. If the hash of the
-    type were missing, ROS 2 Iron and later releases would print a warning.
+    A reliable writer is compatible with reliable and with best-effort readers. The user data
+    contain the hash of the type, because ROS 2 Iron and later releases print a warning if the hash
+    is missing.
     """
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration

@@ -48,7 +48,7 @@ INPUTS = {
                           RosTopic("/external/fingertip", "geometry_msgs/msg/PointStamped", False),
                           "point of the finger's pad that touches the sheet"),
 }  # fmt: skip
-"""The possible external inputs, by the flexsheet topic on which each is published."""
+"""For each flexsheet topic that accepts external messages, the ROS topic of these messages."""
 
 
 @dataclass(slots=True)

@@ -98,7 +98,9 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return the total waiting time (s) of a process's main thread, or None if it is unknown.
+        """Return the total waiting time (s) of the main thread of a process.
+
+        Returns None if the time is unknown.
         """
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()

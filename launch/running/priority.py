@@ -30,10 +30,10 @@ def _has_cap_sys_nice() -> bool:
 
 
 def min_node_nice() -> int:
-    """Return the minimum niceness that is permitted for a node.
+    """Return the minimum configured niceness that is permitted for a node.
 
-    This is the minimum that the user is permitted to set, or the niceness of this process if it is
-    lower.
+    This is the most negative change of niceness that the user is permitted to make. If the niceness
+    of this process is lower, it is returned instead.
     """
     return min(min_nice_step(), os.getpriority(os.PRIO_PROCESS, 0))
 

@@ -67,8 +67,7 @@ class Run:
 
     @property
     def host(self) -> str | None:
-        """Return the host whose nodes the run started, or None if nodes of all hosts were started.
-        """
+        """Return the host whose nodes the run started, or None if it started all hosts' nodes."""
         try:
             return (self.directory / HOST_FILE).read_text()
         except FileNotFoundError:

@@ -4,11 +4,11 @@
         await graph.wait_ready()
         ...
 
-Every process is a separate session. A process runs one node, or all nodes that name the same
-process in the launch file. It reports through a pipe that its nodes are ready. When it exits, its
-restart policy is applied. To stop a process, the launcher sends SIGINT, SIGTERM and finally
-SIGKILL. The launcher needs no threads. Its event loop learns from pidfds that processes have
-exited, and reads logs and readiness from pipes.
+Every process has its own session. A process runs one node, or all nodes that name the same process
+in the launch file. It reports through a pipe that its nodes are ready. When it exits, its restart
+policy is applied. To stop a process, the launcher sends SIGINT, SIGTERM and finally SIGKILL. The
+launcher needs no threads. Its event loop waits for process file descriptors (pidfds), which report
+the exit of a process, and for pipes with the logs and heartbeats of processes.
 """
 
 from __future__ import annotations
@@ -577,10 +577,10 @@ class RunningGraph:
         return source_ns
 
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
-        """Publish a message that later subscribers also receive, and return its source timestamp
-        (ns).
+        """Publish a message that later subscribers also receive.
 
-        Returns None if there is no message, or if the launcher is not a writer of the topic.
+        Returns the source timestamp (ns) of the message. Returns None if there is no message, or if
+        the launcher is not a writer of the topic.
         """
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:
