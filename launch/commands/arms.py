@@ -80,10 +80,11 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """Engage the software e-stop of the arms until you run `flexsheet arms reset`.
+    """Engage the software emergency stop (e-stop) of the arms.
 
-    This command does not replace the hard-wired e-stop. Without --run, it stops the arms of all
-    graphs of this user on this computer.
+    The e-stop remains engaged until you run `flexsheet arms reset`. This command does not replace
+    the hard-wired e-stop. Without --run, it stops the arms of all graphs of this user on this
+    computer.
 
     The exit code is 0 if the stop is confirmed by a launcher or by a node that controls an arm. It
     is also 0 if both arms report the stop.

@@ -313,9 +313,9 @@ def verify(
 ) -> None:
     """Run a node twice on its recorded inputs, and compare the outputs.
 
-    The exit code is 1 if the two runs differ, if the node fails, or if the node cannot be replayed.
-    The exit code is 3 if the two runs are equal but differ from the recorded outputs. A possible
-    reason is that the node reads the system clock.
+    The exit code is 1 if the two runs have different outputs, if the node fails, or if the node
+    cannot be replayed. The exit code is 3 if the two runs have the same outputs, but these differ
+    from the recorded outputs. A possible reason is that the node reads the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
@@ -518,7 +518,10 @@ async def _record(
     for name in names:
         if name not in plan.writers:
             option = "--include" if name in parameters.include else "--topic"
-            raise CommandError(f"{option} {name}: the topic has no writer in the running graph")
+            raise CommandError(
+                f"{option} {name}: the topic has no writer in the running graph; "
+                "`flexsheet topic list` lists its topics"
+            )
     config = NodeConfig(
         name="bag_record",
         type="recorder",

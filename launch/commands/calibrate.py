@@ -127,8 +127,8 @@ def stereo(
 ) -> None:
     """Calibrate both cameras of a stereo camera and their relative pose.
 
-    The board images are files (--left, --right), captured live (--device-source, --scene) or
-    simulated (--twin).
+    The board images are read from files (--left, --right), captured live (--device-source, --scene)
+    or simulated (--twin).
     """
     from flexsheet.launch.calibration.capture import Capture
     from flexsheet.launch.calibration.stereo import calibrate_stereo
@@ -223,7 +223,7 @@ def check(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Check a calibration with images of a board that were not used to compute it."""
+    """Check a calibration with board images that were not used to compute the calibration."""
     from flexsheet.launch.calibration.check import check_stereo
     from flexsheet.messages.calibration import load_calibration
 
@@ -264,7 +264,7 @@ def cross_check(
     ] = 1,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Cross-validate a calibration with image pairs that were not used to compute it.
+    """Cross-validate the calibration of a stereo camera with images of a board.
 
     The command calibrates repeatedly. Each time, it omits some of the image pairs, and then
     measures the board in the omitted pairs. It also prints the errors of a calibration that uses

@@ -414,8 +414,8 @@ def gestures(
         typer.Option(
             "--gesture",
             metavar="NAME",
-            help="Name of a gesture, or CSV file with a fingertip path; repeat for several; "
-            "default: all gestures.",
+            help="Name of a gesture, or CSV file with a fingertip path; repeat the option "
+            "for several gestures; default: all gestures.",
             autocompletion=complete.gestures,
         ),
     ] = None,

@@ -70,8 +70,9 @@ def robustness(
     """Measure the errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
     For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
-    separate process runs a graph with one stroke. The errors of image and force are computed at
-    rest, without a graph. To continue an interrupted command, repeat it with the same --output.
+    separate process runs a graph with one stroke. The errors of image and force are computed with
+    the sheet at rest, without a graph. To continue an interrupted command, repeat it with the same
+    --output.
     """
     from flexsheet.launch.experiments import robustness as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile

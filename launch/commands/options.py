@@ -35,9 +35,9 @@ FORMER_NAMES = {
     "service": "systemd",
     "stand-down": "disable",
 }
-"""The current names of renamed options and commands, by former name.
+"""The current name of each renamed option or command.
 
-The former names still work, but the help does not show them.
+The keys are the former names. They still work, but the help does not show them.
 """
 
 

@@ -194,9 +194,9 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
 
 
 SHOWN_UNITS = {"m": (1e3, "mm"), "m/N": (1e6, "µm/N"), "rad": (math.degrees(1.0), "°")}
-"""For each SI unit, the factor by which printed values are multiplied, and the printed unit.
+"""The factor by which printed values in an SI unit are multiplied, and the printed unit.
 
-Values in other units are not converted.
+The keys are SI units. Values in other units are not converted.
 """
 
 

@@ -124,7 +124,7 @@ def set_parameter(
         live = ", ".join(f"{node.name}.{one}" for one in sorted(_live(node))) or "none"
         raise CommandError(
             f"{parameter}: this parameter cannot change while the node runs; start the graph again "
-            f"with --set {parameter}={value} (parameters that may change: {live})"
+            f"with --set {parameter}={value} (parameters that can change: {live})"
         )
     try:
         parsed = parse_value(value)

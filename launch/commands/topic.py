@@ -50,7 +50,7 @@ WindowOption = Annotated[
     typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
 ]
 REPORT_DELAY_S = 3.0
-"""The time without a message, in seconds, after which the command reports that none has arrived."""
+"""The time (s) after which the command reports that no message has arrived."""
 
 SHORT_ARRAY = 36
 """The maximum number of elements of an array that is printed completely."""
@@ -543,7 +543,9 @@ def _parse_message(topic: Topic, text: str) -> Message:
         try:
             text = Path(source).read_text()
         except OSError as error:
-            raise CommandError(f"{source}: cannot be read: {error.strerror}") from error
+            raise CommandError(
+                f"{source}: cannot be read: {error.strerror}; check the path"
+            ) from error
     try:
         try:
             value = parse_json(text)

@@ -41,7 +41,7 @@ def tune(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Method family to tune; repeat the option for several; default: all.",
+            help="Method family to tune; repeat the option for several families; default: all.",
             autocompletion=complete.tuned_families,
         ),
     ] = None,

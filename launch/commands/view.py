@@ -47,7 +47,7 @@ def view(
 
     In the viewer, open a connection of the type "Foxglove WebSocket" with the printed address, and
     import the printed layout file. The server is read-only and accepts only connections from this
-    computer. To use a viewer on another computer, first run there:
+    computer. To use a viewer on another computer, first run this command there:
     ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER
     """
     try:

@@ -16,7 +16,7 @@ from flexsheet.messages.scene import Lens, Mesh, Pose, Scene
 from flexsheet.messages.units import find_unit
 
 LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
-"""The types whose keys have a group of their own, although other types contain them."""
+"""The types whose keys have a group of their own, because several other types contain them."""
 
 EFFECTS: Mapping[str, str] = {
     "name": "name in logs, bags and reports",

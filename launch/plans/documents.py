@@ -140,7 +140,7 @@ class Document:
     overrides: dict[Key, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     extended: dict[Key, Path] = field(default_factory=dict)
-    """For each key that was inherited from another file by `extend`, the source file."""
+    """The source file of each key that the method `extend` has inherited from another file."""
 
     def where(self, key: Key) -> str:
         """Return the location of `key` for error texts.
@@ -220,7 +220,10 @@ class Document:
                 target[part] = {}
             if not isinstance(target[part], dict):
                 raise BadInputError.single(
-                    origin, key, f'"{part}" is not a mapping, so it contains no keys'
+                    origin,
+                    key,
+                    f'"{part}" is not a mapping, so it contains no keys',
+                    "correct the path of the key",
                 )
             target = target[part]
         target[key[-1]] = value
@@ -325,7 +328,7 @@ def read_document(path: Path) -> Document:
             str(path), (), f"the file is not UTF-8 text: {error}; save the file as UTF-8"
         ) from error
     if len(text) > MAX_TEXT_LENGTH:
-        what = f"the file has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
+        what = f"the file has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed; shorten it"
         raise BadInputError.single(str(path), (), what)
     try:
         tree = _parse_tree(text)
@@ -486,7 +489,7 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 def _existing_part(document: Document, key: Key) -> Key:
     """Return the longest prefix of `key` that exists in the document.
 
-    `key` may be an error location from pydantic, which can contain names of types that are not keys
+    `key` can be an error location from pydantic, which can contain names of types that are not keys
     of the document.
     """
     values: Any = document.values

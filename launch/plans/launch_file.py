@@ -241,7 +241,7 @@ def apply_setting(document: Document, setting: str) -> None:
 def apply_record(document: Document, bag: Path) -> None:
     """Set the bag file of the recorder, as the option --record does.
 
-    If there is no recorder, add one.
+    If the graph has no recorder, a recorder is added.
     """
     origin = f"--record {bag}"
     if bag.exists():

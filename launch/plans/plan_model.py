@@ -184,7 +184,10 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """A process and its nodes, with common niceness, restart policy and heartbeat timeout."""
+    """A process and its nodes.
+
+    The nodes have the same niceness, restart policy and heartbeat timeout.
+    """
 
     name: str
     nodes: tuple[ResolvedNode, ...]

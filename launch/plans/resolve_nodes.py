@@ -278,10 +278,10 @@ CALIBRATION_CHECKS: dict[
     ),
     ParameterMark.MARKER_CALIBRATION: (load_marker_calibration, refuse_other_marker),
 }
-"""For each kind of calibration file, two functions.
+"""The two functions that load and check each kind of calibration file.
 
-The first function loads the file, and the second rejects a calibration that belongs to another
-scene.
+The first function loads the file. The second function rejects the calibration if it belongs to
+another scene.
 """
 
 
@@ -306,8 +306,8 @@ def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: 
 def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
     """Return all parameters of a node as JSON values, including defaults.
 
-    resolve_paths: whether to make paths absolute; paths in the launch file are relative to its
-        folder.
+    resolve_paths: whether to make paths absolute. Otherwise, paths remain relative to the folder of
+        the launch file.
     """
     assert entry.parameters is not None  # otherwise the load has failed
     values = entry.parameters.model_dump(mode="json")

@@ -1,8 +1,8 @@
 """Bridge a running graph to ROS 2: publish its topics over DDS, and accept external inputs.
 
 The bridge has the permissions of a command-line tool. It is allowed to read all topics of the
-graph, and to write the topics that tools are allowed to write. External messages have the writer
-name of command-line tools.
+graph, and to write the topics that tools are allowed to write. External messages are published in
+the graph under the name of the command-line tools.
 """
 
 from __future__ import annotations

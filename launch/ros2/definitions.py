@@ -5,7 +5,7 @@ A message type or a group of fields becomes a ROS type of the same name. Fields 
     bool, int, float, text              bool, int64, float64, string
     timestamp                           builtin_interfaces/Time
     array                               flat sequence or array of its elements, row by row
-    value that may be None              sequence with no or one element
+    value that can be None              sequence with at most one element
     tuple of values of one type         sequence of the values
     anything else (such as a choice between several types)    string that contains JSON
 

@@ -135,8 +135,8 @@ class Source:
 
     topic: topic of the message.
     at_ns: source timestamp of the message, ns since 1970.
-    scene, skin: latest messages with the scene and the surface of the soft body; None before the
-        first message.
+    scene, skin: latest messages with the scene and the surface of the soft body. They are None
+        before the first message.
     flanges: latest flange poses (4, 4) by side.
     """
 
@@ -300,7 +300,7 @@ FORCE_DIRECTIONS = {
     "left_edge": (1.0, 0.0, 0.0),
     "right_edge": (-1.0, 0.0, 0.0),
 }
-"""For each sensor axis, the direction (3,) of a positive force, in the frame of the sheet."""
+"""The direction (3,) of a positive force, in the frame of the sheet, for each sensor axis."""
 
 
 def _measured_force(force: Force, source: Source) -> Any | None:
@@ -410,9 +410,9 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
 def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
     """Return the corners (4, 3), in m, of a flat sheet between both clamped edges.
 
-    The order is lower left, upper left, lower right, upper right.
+    The order of the corners is lower left, upper left, lower right, upper right.
 
-    flanges: poses (4, 4) by side.
+    flanges: flange pose (4, 4) of each arm, by side.
 
     Returns None if the scene or an arm is unknown.
     """

@@ -73,7 +73,7 @@ class KeyWatch:
         self._read_ns = 0
 
     def read_changes(self) -> dict[str, KeyChange]:
-        """Update the key ring files, and return the changed keys since the last call, by host.
+        """Update the key ring files, and return the key changes of each host since the last call.
 
         Raises BadInputError, SecurityError or OSError if a file cannot be read or is invalid.
         """

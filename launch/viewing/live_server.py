@@ -1,4 +1,4 @@
-"""Serve a running graph to Foxglove and Lichtblick over their WebSocket protocol, read-only.
+"""Serve a running graph to Foxglove and Lichtblick over their WebSocket protocol.
 
 The server of the Foxglove SDK has no authentication and accepts requests from any web page.
 Therefore the server listens on the loopback interface only. Viewers cannot publish, call services
