@@ -298,7 +298,7 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
 
 
 def logs_on_stderr() -> None:
-    """Write the warnings and errors in the log of a command to stderr.
+    """Direct the log of a command, which contains warnings and errors, to stderr.
 
     By default, structlog writes to stdout, which is reserved for results. Call this function before
     any logger is created.

@@ -328,8 +328,8 @@ def read_document(path: Path) -> Document:
             str(path), (), f"the file is not UTF-8 text: {error}; save the file as UTF-8"
         ) from error
     if len(text) > MAX_TEXT_LENGTH:
-        what = f"the file has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed; shorten it"
-        raise BadInputError.single(str(path), (), what)
+        what = f"the file has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
+        raise BadInputError.single(str(path), (), what, "shorten the file")
     try:
         tree = _parse_tree(text)
         values = plain(tree)
@@ -440,7 +440,7 @@ def did_you_mean(name: object, known: Sequence[str]) -> str:
 def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
     """Validate the values below the key `at` against a pydantic model, and return the model object.
 
-    Raises BadInputError with all problems.
+    Raises BadInputError if values are invalid. The error lists all problems.
     """
     values: Any = document.values
     for part in at:

@@ -90,7 +90,7 @@ def load_graph(
     needed: topics that the caller reads. The nodes that write these topics are started.
     without: parts of the display that are omitted.
 
-    Raises BadInputError with all errors of the file.
+    Raises BadInputError, which lists all errors of the file, if the file is invalid.
     """
     document = read_launch_file(path)
     if record is not None:

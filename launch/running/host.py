@@ -64,7 +64,7 @@ class HostAgent:
 
     The agent works between the calls of `start` and `close`.
 
-    code: git commit that `HostStatus` reports.
+    code: git commit of the running code, which is a part of the published status.
     pids: function that returns the process ids of the running nodes by node name.
     """
 

@@ -82,7 +82,7 @@ STACK_DUMP_S = 0.5
 FORK_SERVER = "fork-server"
 LOG_READ_BYTES = 65_536
 GROUP_REAPS, GROUP_REAP_S = 20, 0.1
-"""The number of attempts to reap the child processes of a node, and the time (s) between them."""
+"""The number of attempts to reap the child processes of a node, and the time between them (s)."""
 
 Report = Callable[[str, str], None]
 """A function that is called with (node, line) for each log line.
