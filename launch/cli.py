@@ -201,7 +201,10 @@ def error_text(error: Exception) -> str:
 
 
 def explained_by(error: Exception) -> str | None:
-    """Return the command line that explains an error, or None if the text contains the remedy."""
+    """Return the command line that explains an error.
+
+    Returns None if the text of the error already contains the remedy.
+    """
     if not isinstance(error, FlexsheetError) or isinstance(error, CommandError):
         return None
     if error.exit_code == BAD_INPUT or isinstance(error.__cause__, FileNotFoundError):

@@ -1,4 +1,4 @@
-"""Subcommands of `flexsheet`, one module per command.
+"""The subcommands of `flexsheet`. Each command has its own module.
 
 Commands import libraries only when they run, so that `--help` and short commands start fast.
 """

@@ -1,4 +1,7 @@
-"""`flexsheet apparatus`: sample and show true parameters of simulated hardware (apparatus)."""
+"""`flexsheet apparatus`: sample and show the true parameters of simulated hardware.
+
+A set of these parameters is called an apparatus.
+"""
 
 from __future__ import annotations
 
@@ -77,10 +80,10 @@ def show(
     scene: options.SceneOption = options.CYLINDER,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Check an apparatus, and list how its parameters differ from the scene.
+    """Check an apparatus, and list its parameters that differ from the scene.
 
-    The exit code is 2 if the file has unknown keys or impossible values, or belongs to another
-    scene.
+    An apparatus is a set of true parameters of simulated hardware. The exit code is 2 if the file
+    has unknown keys or impossible values, or belongs to another scene.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.launch.plans.plan import load_scene

@@ -80,10 +80,11 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """Engage the software e-stop of the arms until you run `flexsheet arms reset`.
+    """Engage the software emergency stop (e-stop) of the arms.
 
-    This command does not replace the hard-wired e-stop. Without --run, it stops the arms of all
-    graphs of this user on this computer.
+    The e-stop remains engaged until you run `flexsheet arms reset`. This command does not replace
+    the hard-wired e-stop. Without --run, it stops the arms of all graphs of this user on this
+    computer.
 
     The exit code is 0 if the stop is confirmed by a launcher or by a node that controls an arm. It
     is also 0 if both arms report the stop.
@@ -228,9 +229,9 @@ class _Arms:
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Publish an e-stop at once, and return the result and its duration.
+        """Publish an e-stop at once, and return the outcome and the duration of the attempt.
 
-        The topic is latched, so subscribers that connect later also receive the e-stop.
+        The topic `estop` is latched, so subscribers that connect later also receive the e-stop.
         """
         from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
@@ -247,7 +248,10 @@ class _Arms:
         return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Wait until `done` returns True for the recent arm states; return False on a timeout."""
+        """Wait until `done` returns True for the recent states of the arms.
+
+        Returns False if this does not happen before the timeout.
+        """
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
             ages_s = {side: now_s - received_s for side, received_s in self._received_s.items()}
@@ -268,7 +272,7 @@ def _command(
 
     Returns the exit code.
 
-    command: topic and message to publish; None: nothing is published.
+    command: topic and message to publish. If it is None, nothing is published.
     done: function that receives the arm states, and returns True when the command has had its
         effect.
     """

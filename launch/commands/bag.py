@@ -313,9 +313,9 @@ def verify(
 ) -> None:
     """Run a node twice on its recorded inputs, and compare the outputs.
 
-    The exit code is 1 if the two runs differ, if the node fails, or if the node cannot be replayed.
-    The exit code is 3 if the two runs are equal but differ from the recorded outputs. A possible
-    reason is that the node reads the system clock.
+    The exit code is 1 if the two runs have different outputs, if the node fails, or if the node
+    cannot be replayed. The exit code is 3 if the two runs have the same outputs, but these differ
+    from the recorded outputs. A possible reason is that the node reads the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
@@ -408,7 +408,10 @@ def plot(
 
 
 def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
-    """Print the number of exported messages by topic or channel, and list the unreadable topics."""
+    """Print the number of exported messages of each topic or channel.
+
+    Topics that cannot be read are also listed.
+    """
     if result.unreadable:
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
@@ -496,7 +499,8 @@ async def _record(
 ) -> int:
     """Record topics of the running graph in this process, and return the exit code 0.
 
-    given: parameters of the recorder.
+    given: values of the recorder's parameters.
+    seconds: duration of the recording. If it is None, the duration is not limited.
     """
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file
@@ -514,7 +518,10 @@ async def _record(
     for name in names:
         if name not in plan.writers:
             option = "--include" if name in parameters.include else "--topic"
-            raise CommandError(f"{option} {name}: the topic has no writer in the running graph")
+            raise CommandError(
+                f"{option} {name}: the topic has no writer in the running graph; "
+                "`flexsheet topic list` lists its topics"
+            )
     config = NodeConfig(
         name="bag_record",
         type="recorder",

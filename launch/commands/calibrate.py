@@ -127,8 +127,8 @@ def stereo(
 ) -> None:
     """Calibrate both cameras of a stereo camera and their relative pose.
 
-    The board images are files (--left, --right), captured live (--device-source, --scene) or
-    simulated (--twin).
+    The board images are read from files (--left, --right), captured live (--device-source, --scene)
+    or simulated (--twin).
     """
     from flexsheet.launch.calibration.capture import Capture
     from flexsheet.launch.calibration.stereo import calibrate_stereo
@@ -223,7 +223,7 @@ def check(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Check a calibration with images of a board that were not used to compute it."""
+    """Check a calibration with board images that were not used to compute the calibration."""
     from flexsheet.launch.calibration.check import check_stereo
     from flexsheet.messages.calibration import load_calibration
 
@@ -264,7 +264,7 @@ def cross_check(
     ] = 1,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Cross-validate a calibration with image pairs that were not used to compute it.
+    """Cross-validate the calibration of a stereo camera with images of a board.
 
     The command calibrates repeatedly. Each time, it omits some of the image pairs, and then
     measures the board in the omitted pairs. It also prints the errors of a calibration that uses
@@ -392,9 +392,11 @@ def make_provenance() -> dict[str, Any]:
 
 
 def write_scene_values(scene_file: Path, values: Mapping[str, Any], copy: Path) -> None:
-    """Write a copy of a scene file with other values; preserve comments and layout.
+    """Write a copy of a scene file in which some values are replaced.
 
-    values: new values by the dotted path of the key.
+    Comments and layout are preserved.
+
+    values: new values. Each key is the dotted path of the value in the scene file.
 
     Raises BadInputError if the changed scene is invalid.
     """
@@ -416,9 +418,9 @@ def write_scene_values(scene_file: Path, values: Mapping[str, Any], copy: Path) 
 
 
 def pose_values(key: str, pose: Pose) -> dict[str, Any]:
-    """Return the position and the angles of a pose by their dotted paths in a scene file.
+    """Return the position and the angles of a pose as new values for a scene file.
 
-    key: dotted path of the pose.
+    key: dotted path of the pose in the scene file. The keys of the result begin with this path.
     """
     return {
         f"{key}.position_m": [round_digits(one) for one in pose.position_m],
@@ -453,10 +455,11 @@ def require_twin(apparatus: str | None, *, simulated: bool) -> None:
 def load_true_devices(
     text: str | None, scene: Scene, scene_file: Path | None = None
 ) -> Apparatus | None:
-    """Load the apparatus: the true parameters of the simulated hardware.
+    """Load the true parameters of the simulated hardware (the apparatus).
 
-    The parameters refer to the world frame of the stereo camera, as all calibrations do. If `text`
-    is None, the result is None.
+    The poses refer to the world frame of the stereo camera, as they do in all calibrations.
+
+    text: apparatus file, or a random sample such as "seed:7". If it is None, the result is None.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.nodes.twin.truth import align_world_to_camera

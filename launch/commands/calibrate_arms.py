@@ -239,7 +239,8 @@ async def record_poses(
 ) -> int:
     """Pass images and arm states of the running graph to a recorder until it has enough poses.
 
-    on_arm: function that is called with each message of the topics `arms` and its arrival time (s).
+    on_arm: function that is called with each received arm state and its arrival time (s).
+    arms: topics of the arm states.
     size: required width and height of the images, px.
     places: number of poses.
 
@@ -369,7 +370,10 @@ def _make_arm_base(fit: BaseFit) -> ArmBase:
 
 
 def list_scene_values(measured: ArmsCalibration) -> dict[str, Any]:
-    """Return the calibrated poses of the arm bases, by their dotted paths in a scene file."""
+    """Return the calibrated poses of the arm bases as new values for a scene file.
+
+    Each key is a dotted path, such as `arms.left.world_from_base.rpy_rad`.
+    """
     values: dict[str, Any] = {}
     for side, base in (("left", measured.left), ("right", measured.right)):
         if base is not None:
@@ -380,7 +384,7 @@ def list_scene_values(measured: ArmsCalibration) -> dict[str, Any]:
 def _true_errors(
     scene: Scene, side: Side, fit: BaseFit, apparatus: Apparatus | None, seed: int
 ) -> dict[str, float]:
-    """Return the true errors (m, rad) of the flange pose of a simulated, calibrated arm.
+    """Return the true errors (m, rad) of the flange pose of a simulated arm after calibration.
 
     The errors are computed at the arm's start position. They do not include backlash.
     """
@@ -433,7 +437,10 @@ def _print_result(
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return distance (m) and angle (rad) between a calibrated base and the base in the scene."""
+    """Return how far a calibrated arm base is from its pose in the scene.
+
+    The result is a distance (m) and an angle (rad).
+    """
     import numpy as np
 
     from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation

@@ -104,7 +104,10 @@ def edges(
 
 
 def list_scene_values(fits: dict[Side, EdgeFit]) -> dict[str, Any]:
-    """Return the fitted parameters of both arms, by their dotted paths in a scene file."""
+    """Return the fitted parameters of both arms as new values for a scene file.
+
+    Each key is a dotted path, such as `arms.left.world_from_base.rpy_rad`.
+    """
     values: dict[str, Any] = {}
     for side, fit in fits.items():
         arm, key = fit.arm, f"arms.{side}"
@@ -126,10 +129,10 @@ def edges_capture(
 ) -> None:
     """Record marks on both clamps for `calibrate edges`, from the running graph.
 
-    Fix three bright marks on each clamp: one at its centre, and two that are 45 % of its length
-    above and below the centre. Move the sheet to poses that differ in position, rotation and
-    stretch. The command records a pose when both arms are at rest, and stops after 24 poses or at
-    Ctrl-C.
+    Fix three bright marks on each clamp: one at the clamp's centre, one above it and one below it.
+    The upper and the lower mark are 45 % of the clamp's length away from the centre. Move the sheet
+    to poses that differ in position, rotation and stretch. The command records a pose when both
+    arms are at rest. It stops after 24 poses or at Ctrl-C.
     """
     from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene

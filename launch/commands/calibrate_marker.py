@@ -58,7 +58,7 @@ def marker(
 ) -> None:
     """Determine the position of the marker relative to the finger pad, which touches the sheet.
 
-    The finger touches points of known position. The touches are rows of a CSV file (--rows,
+    The finger touches points whose positions are known. The touches are rows of a CSV file (--rows,
     --scene) or are simulated (--twin).
     """
     from flexsheet.launch.calibration.touches import read_touches, simulate_touches
@@ -92,6 +92,7 @@ def marker(
 def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerCalibration:
     """Fit the position of the marker on the finger to touches of known points.
 
+    touches: measurements in which the finger touches a point whose position is known.
     source: text that names the origin of the data in the calibration.
 
     Raises CommandError if the touches do not determine the position.

@@ -100,9 +100,9 @@ def projector(
 ) -> None:
     """Calibrate the pose and the lens of the projector, and write the result into a scene.
 
-    The data are stereo images of Gray-code patterns on the sheet in three or more poses
-    (--pictures). Alternatively, they are four corners that you have set manually (--corners). With
-    --twin, the images are simulated.
+    The data are stereo images of Gray-code patterns that are projected onto the sheet, in three or
+    more poses of the sheet (--pictures). Alternatively, the data are four corners that you have set
+    manually (--corners). With --twin, the images are simulated.
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import calibrate_projector, measure_points
@@ -189,6 +189,7 @@ def simulate_views(
     true: simulated projector.
     apparatus: true parameters of the other simulated devices, including the arms that hold the
         sheet. If it is None, the sheet is flat and exactly at the commanded poses.
+    poses: number of sheet poses.
     """
     from rich.progress import track
 
@@ -248,7 +249,10 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
 
 
 def list_scene_values(projector: Projector) -> dict[str, Any]:
-    """Return the pose and the lens of a projector, by their dotted paths in a scene file."""
+    """Return the pose and the lens of a projector as new values for a scene file.
+
+    Each key is a dotted path, such as `projector.world_from_projector.rpy_rad`.
+    """
     values = pose_values("projector.world_from_projector", projector.world_from_projector)
     for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
         values[f"projector.lens.{key}"] = round_digits(getattr(projector.lens, key))
@@ -282,7 +286,10 @@ def _print_result(
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the mean and maximum image errors (mm) at the eye before and after calibration.
+    """Return the errors (mm) of the projected image that the user sees.
+
+    The result has an entry "before" and an entry "after" the calibration. Each entry contains the
+    mean and the maximum error.
 
     fitted: calibrated projector.
     true: simulated projector.

@@ -152,7 +152,10 @@ def make_calibration(
     """Fit the force model of the sheet to measured pushes, and return the calibration.
 
     lines: line number of each push in its file.
-    with_prior: as in `fit_sheet_model`.
+    with_mooney: whether the weight of the Mooney term of the rubber model is fitted.
+    with_table: whether a table of factors that correct the fitted model is added.
+    with_prior: whether the scene's sheet width and ideal rubber are used as prior values of the
+        fit.
 
     Raises SheetModelFitError if the pushes do not determine the parameters.
     """
@@ -235,7 +238,7 @@ def make_calibration(
 def simulate_pushes(
     scene: Scene, apparatus: Apparatus | None, *, places: bool, seed: int
 ) -> list[MeasuredPush]:
-    """Simulate measured pushes on the sheet of a scene.
+    """Simulate measurements in which a finger pushes the sheet of a scene.
 
     places: whether to push at points all over the sheet, not only at its centre.
     """

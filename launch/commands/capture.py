@@ -92,8 +92,9 @@ def simulate_views(
 def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     """Write the accepted image pairs to a new folder: left01.png, right01.png, ...
 
-    The function stops when the board poses meet all requirements, when `views` ends, or at Ctrl-C.
-    It prints the requirements that are not met. Returns the number of pairs, at least one.
+    The function stops when the board poses meet all requirements, when `views` ends, or when the
+    user presses Ctrl-C. It prints the requirements that are not met. Returns the number of pairs,
+    at least one.
     """
     if folder.exists():
         raise CommandError(f"--pictures {folder}: the folder exists; name a new folder")
@@ -130,9 +131,10 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
 
 @contextmanager
 def _show_coverage(capture: Capture) -> Iterator[Any]:
-    """Show the coverage of board poses, and yield a function (hint, accepted) that updates it.
+    """Show which of the required board poses have been captured.
 
-    If stderr is not a terminal, one line is printed for each accepted pair.
+    The function yields another function (hint, accepted), which updates the display after each
+    image pair. If stderr is not a terminal, one line is printed for each accepted pair.
     """
     if not words.is_terminal:
 
@@ -149,9 +151,12 @@ def _show_coverage(capture: Capture) -> Iterator[Any]:
 
 
 def coverage_view(capture: Capture, hint: str) -> RenderableType:
-    """Return tables of the actual and required numbers of image pairs by cell, tilt and distance.
+    """Return tables with the actual and the required numbers of image pairs.
 
-    A cell is a part of the camera image.
+    The pairs are counted for each cell (part of the image), tilt of the board, and distance of the
+    board.
+
+    hint: text that is displayed below the tables.
     """
     from rich.columns import Columns
     from rich.console import Group

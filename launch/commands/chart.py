@@ -107,10 +107,10 @@ def chart(
 ) -> None:
     """Measure the computing time and error of the methods in a method family, and draw a chart.
 
-    For each method, the command prints the maximum of the median times and of the errors over all
-    cases that the method supports. A method is marked "front" if no other method is both faster and
-    more accurate. `system` measures whole graphs instead. To continue an interrupted measurement of
-    `system`, repeat the command with the same --output.
+    A method is measured in all cases that it supports. For each method, the command prints the
+    largest median time and the largest error of these cases. A method is marked "front" if no other
+    method is both faster and more accurate. `system` measures whole graphs instead. To continue an
+    interrupted measurement of `system`, repeat the command with the same --output.
     """
     logs_on_stderr()
     chosen = [find_file(one, SCENES) for one in scene_files or ()]
@@ -173,7 +173,8 @@ def _report(progress: Callable[[str], None], family: str, text: str) -> None:
 def _measure_system(measure: Callable[..., dict[str, Any]], image: Path, *, as_json: bool) -> None:
     """Measure graph configurations, and write the results and a chart.
 
-    measure: function that measures, and reports its progress to the function that it receives.
+    measure: function that measures and returns the results. It receives a function to which it
+        reports its progress.
     """
     import json
 

@@ -127,9 +127,9 @@ def commission(
 
     The steps are camera, arms, edges, sheet, projector, marker, eyes, delays and verification.
     Finished steps are not repeated. With --apparatus, all devices are simulated, and the steps take
-    a few minutes. Otherwise, if the data of a step are missing, the command states how to capture
-    them and stops with exit code 1. The exit code is 3 if the laboratory is not good or not
-    verified.
+    a few minutes. Otherwise, if the data of a step are missing, the command explains how to capture
+    them and stops with exit code 1. The exit code is 3 if the laboratory has not been verified, or
+    if the verification has found a problem.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName, is_good
     from flexsheet.launch.commands.calibrate import FOUR_BITS, parse_board
@@ -197,7 +197,7 @@ def _parse_step(option: str, text: str) -> StepName:
 
 
 def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
-    """Return the texts by step from the values STEP=TEXT of a command-line option.
+    """Parse the values STEP=TEXT of a command-line option, and return the text of each step.
 
     Raises CommandError if a step is unknown or a text is empty.
     """

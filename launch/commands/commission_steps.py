@@ -72,7 +72,7 @@ CALLIPER_M = 3e-4
 WEIGHING_RATIO = 0.004
 """The relative standard deviation of the measured mass per area of a simulated sheet.
 
-The causes are the errors of the scale (0.2 g) and of the ruler (0.5 mm).
+It results from the errors of the scale (0.2 g) and of the ruler (0.5 mm).
 """
 
 INSTRUCTIONS: dict[StepName, str] = {
@@ -118,7 +118,8 @@ def open_laboratory(
     If the devices are simulated, their true parameters are written to an apparatus file in the
     folder.
 
-    apparatus: apparatus file or seed; None for real devices.
+    apparatus: apparatus file, or a random sample such as "seed:7". It is None if the devices are
+        real.
     options: fields of `Laboratory`.
     """
     plan = load_graph(launch_file)
@@ -138,9 +139,9 @@ def open_laboratory(
 class Laboratory:
     """The devices of one laboratory: simulated devices, or files with the data of real devices.
 
-    apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
-        devices.
-    data: file or folder with the captured data, by step.
+    apparatus: true parameters of simulated devices, in the world frame of the camera. It is None if
+        the devices are real.
+    data: for each step, the file or folder with the captured data.
     finger_radius_m: measured radius of the fingertip, for real devices.
     sheet_kg_per_m2: measured mass per area of a real sheet.
     seconds: duration of the stroke in the verification.
@@ -527,8 +528,8 @@ class Laboratory:
     ) -> MeasuredLag:
         """Measure the time from the buffer swap of a frame to the middle of its display.
 
-        stamp: measured offset of the camera's timestamps; None if it is unknown.
-        added_s: correction (s) of this offset that the timestamps in the data already contain.
+        stamp: measured offset of the camera's timestamps. It is None if the offset is unknown.
+        added_s: part (s) of this offset for which the timestamps in the data are already corrected.
         """
         from flexsheet.launch.calibration.delays import MeasuredLag
         from flexsheet.launch.calibration.display_latency import (
@@ -602,7 +603,7 @@ def _format_check_command(lab: Commissioning) -> str:
 
 
 def collect_knowledge(lab: Commissioning) -> Knowledge:
-    """Collect the calibrations and covariances from which errors are predicted."""
+    """Collect the calibrations and covariances that are needed to predict errors."""
     from flexsheet.launch.calibration.prediction import (
         EYE_STD_M,
         SHEET_MASS_STD_RATIO,
@@ -726,16 +727,16 @@ def describe_sheet(
     width_m: float,
     mass_kg_per_m2: float | None = None,
 ) -> dict[str, float]:
-    """Return the scene values of a measured sheet, by their dotted paths.
+    """Return the parameters of a measured sheet as new values for a scene file.
 
-    The flange compliances are multiplied by the tension of the scene's sheet and divided by the
-    tension of the measured sheet. The tension then displaces the flanges as far as the step `edges`
-    measured.
+    Each key is a dotted path, such as `sheet.width_m`. The flange compliances are multiplied by the
+    tension of the scene's sheet and divided by the tension of the measured sheet. The tension then
+    displaces the flanges as far as the step `edges` measured.
 
     modulus_thickness_n_per_m: product of Young's modulus and thickness.
     width_m: width without tension.
-    mass_kg_per_m2: mass per area, from which the density is computed; None: the result contains no
-        density.
+    mass_kg_per_m2: mass per area, from which the density is computed. If it is None, the result
+        contains no density.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def _keys_of(module: str, name: str) -> Callable[[str], list[str]]:
     """Return a function that completes the keys of a dictionary.
 
-    The dictionary is the variable `name` of a module.
+    The dictionary is the variable `name` of the given module.
     """
 
     def complete(incomplete: str) -> list[str]:
@@ -35,7 +35,7 @@ node_types = _keys_of("flexsheet.nodes", "NODES")
 
 
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the matching host names of the launch file on the command line."""
+    """Return the matching host names of the launch file that the command line contains."""
     from flexsheet.launch.plans.documents import BadInputError
     from flexsheet.launch.plans.plan import load_graph
 

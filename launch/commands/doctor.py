@@ -95,12 +95,12 @@ def check_scene(
 
     The command checks samples of all tilts and push depths in the range, at the minimum and the
     maximum stretch of the sheet. It prints the maximum finger speed that the arms can follow. The
-    exit code is 1 if the arms cannot reach a sample. If they reach all samples but are too slow, a
-    warning is printed.
+    exit code is 1 if the arms cannot reach a sample. A warning is printed if they reach all samples
+    but cannot follow the maximum finger speed of the scene.
 
-    In the joint solution of an RV-1A or RV-2FR, "shoulder front" means that the wrist centre is in
-    front of the plane through the axes of J1 and J2. "Elbow up" means that J3 is greater than its
-    angle when the arm is straight, and "wrist flipped" means that J5 is negative.
+    The joint solutions of an RV-1A or RV-2FR have names. "Shoulder front" means that the wrist
+    centre is in front of the plane through the axes of J1 and J2. "Elbow up" means that J3 is
+    greater than the angle at which the arm is straight. "Wrist flipped" means that J5 is negative.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
@@ -126,7 +126,10 @@ def check_scene(
 
 
 def _print_reach(layout: Layout) -> None:
-    """Print that the working range is not reachable, before the long search for remedies."""
+    """Print a message if the arms do not reach the whole working range.
+
+    The message precedes the search for remedies, which can take minutes.
+    """
     if not layout.reachable:
         words.print(
             f"not reachable: the arms reach {100 * layout.reached.mean():.1f} % of the working "
@@ -135,7 +138,7 @@ def _print_reach(layout: Layout) -> None:
 
 
 def _describe_branch(branch: dict[str, Any]) -> str:
-    """Describe a joint solution by its names, or by its joint angles in degrees."""
+    """Describe a joint solution by names such as "elbow up", or by the joint angles in degrees."""
     if "seed_rad" not in branch:
         return ", ".join(f"{part} {value}" for part, value in branch.items())
     degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])

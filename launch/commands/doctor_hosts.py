@@ -100,9 +100,10 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved graph, and its run on this computer or None if the graph is not running.
+    """Return the resolved graph, and the run in which this computer executes the graph.
 
-    If `launch_file` is None, the newest running graph is used.
+    The run is None if the graph is not running. If `launch_file` is None, the newest running graph
+    is used.
     """
     from flexsheet.launch.plans.plan import load_graph
 
@@ -120,7 +121,7 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
 def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
     """Return the name of this computer among the hosts of a graph.
 
-    requested: name given by the user, or None.
+    requested: name that the user has given. It is None if the user has given no name.
 
     Raises CommandError if the name is unknown, or if the addresses of this computer do not
     determine its name.

@@ -57,7 +57,8 @@ MapOption = Annotated[
 def make_result_folder(output: Path | None, name: str) -> Path:
     """Create a folder for results, and return its path.
 
-    output: path of the folder; None for a new folder in runs/ whose name contains `name`.
+    output: path of the folder. If it is None, the folder is created in runs/, and its name contains
+        `name`.
     """
     from flexsheet.launch.experiments.run import new_folder
 
@@ -413,8 +414,8 @@ def gestures(
         typer.Option(
             "--gesture",
             metavar="NAME",
-            help="Name of a gesture, or CSV file with a fingertip path; repeat for several; "
-            "default: all gestures.",
+            help="Name of a gesture, or CSV file with a fingertip path; repeat the option "
+            "for several gestures; default: all gestures.",
             autocompletion=complete.gestures,
         ),
     ] = None,
@@ -487,7 +488,10 @@ def print_followed(results: list[dict[str, Any]]) -> None:
 
 
 def print_strokes(results: list[dict[str, Any]]) -> None:
-    """Print the mean and standard deviation of the stroke errors beside Table I of the paper."""
+    """Print the mean and standard deviation of the stroke errors, and the values of the paper.
+
+    The paper is Furukawa et al. 2007, Table I.
+    """
     from flexsheet.launch.experiments.stroke import PAPER_TABLE_1
 
     columns = ["moving time"]
@@ -506,7 +510,10 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
 
 def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print the mean errors of each variant over all strokes, with their 95 % intervals."""
+    """Print the mean errors of each variant over all strokes.
+
+    The 95 % confidence interval of each mean is also printed.
+    """
 
     def with_interval(found: dict[str, Any] | None) -> str:
         if found is None:
@@ -568,7 +575,7 @@ def stability(
 
     The stiffness of the object, the impedance of the hand, the delay and its jitter are varied. The
     simulations run with and without the planner's limits on the rendered stiffness. The command
-    compares the simulated critical gain with the predicted one.
+    compares the simulated critical gain with the predicted critical gain.
     """
     import json
 

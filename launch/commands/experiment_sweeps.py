@@ -70,8 +70,9 @@ def robustness(
     """Measure the errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
     For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
-    separate process runs a graph with one stroke. The errors of image and force are computed at
-    rest, without a graph. To continue an interrupted command, repeat it with the same --output.
+    separate process runs a graph with one stroke. The errors of image and force are computed with
+    the sheet at rest, without a graph. To continue an interrupted command, repeat it with the same
+    --output.
     """
     from flexsheet.launch.experiments import robustness as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile
@@ -117,9 +118,10 @@ def robustness(
 
 
 def _print_predictions(found: dict[str, Any]) -> None:
-    """Print how often the predicted errors and the true errors agree about the tolerances.
+    """Print how often predictions and true errors agree that the hardware is within tolerance.
 
-    The table has one row for all reports and one row per metric.
+    The table counts the four combinations of both results. The first row is for whole reports, and
+    each further row is for one metric.
     """
     cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
     every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}
@@ -249,8 +251,8 @@ def follow(
 ) -> None:
     """Measure the sheet's error while it follows a recorded finger, and compute a lower bound.
 
-    The bound is the minimum mean error that arms with the given limits can reach if the whole
-    recording is known in advance.
+    The bound is the minimum mean error that the arms can reach within their motion limits if the
+    whole recording is known in advance.
     """
     from flexsheet.launch.experiments import follow as experiment
     from flexsheet.launch.experiments.gestures import finger_path as load_path

@@ -34,8 +34,9 @@ LAYERS = ("messages", "nodes", "launch")
 class Entry:
     """An explanation of one kind of error or note.
 
-    code: code of an error or note. name: name of the error class, or an empty text. phrase: text
-    that all errors or notes of this kind contain, or an empty text.
+    code: code of an error or note.
+    name: name of the error class, or an empty text.
+    phrase: text that all errors or notes of this kind contain, or an empty text.
     """
 
     code: str
@@ -132,7 +133,7 @@ def find_entries(text: str) -> list[Entry]:
 
 
 def _contains(text: str, phrase: str) -> bool:
-    """Return whether a text contains a phrase, not as a part of longer words."""
+    """Return whether a text contains a phrase that is not a part of longer words."""
     return re.search(rf"(?<!\w){re.escape(phrase)}(?!\w)", text) is not None
 
 

@@ -78,7 +78,10 @@ def list_readers(plan: ResolvedGraph, topic: str) -> list[str]:
 
 @contextmanager
 def receiving(subscribers: Sequence[Subscriber]) -> Iterator[None]:
-    """Receive messages in the running event loop until the context ends."""
+    """Receive messages with the given subscribers until the context ends.
+
+    An event loop must be running.
+    """
     try:
         for each in subscribers:
             each.start()
@@ -111,7 +114,7 @@ async def receive_until(
 ) -> bool:
     """Pass received messages to handlers until `done` returns True; return False on a timeout.
 
-    handlers: function that receives the messages of each topic, by topic name.
+    handlers: for each topic name, the function that receives the messages of the topic.
     """
     from flexsheet.launch.running.tools import make_subscriber
 

@@ -138,7 +138,7 @@ def page_url(console: ResolvedNode) -> str:
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
     """Return the run directory, plan hash and node names of a graph, for JSON output.
 
-    host: host whose nodes are listed; None for all hosts.
+    host: host whose nodes are listed. If it is None, the nodes of all hosts are listed.
     """
     nodes = [node.name for node in plan.nodes_on(host)]
     omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
@@ -146,7 +146,7 @@ def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, A
 
 
 def warn_of_loop_risk(plan: ResolvedGraph) -> None:
-    """Print a warning if the sheet and the hand that touches it may oscillate in this scene."""
+    """Print a warning if the sheet and the hand that touches it can oscillate in this scene."""
     from flexsheet.launch.health.compliance import check_graph
 
     finding = check_graph(plan)
@@ -155,7 +155,10 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """If the planner runs on `host`, check in a thread whether sheet and hand may oscillate."""
+    """Check in a thread whether the sheet and the hand that touches it can oscillate.
+
+    The check is omitted if the planner does not run on `host`.
+    """
     if any(
         issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
     ):
@@ -165,7 +168,7 @@ def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
     """Print the omitted nodes of a graph, and the reason for each omission.
 
-    host: host whose nodes are printed; None for all hosts.
+    host: host whose nodes are printed. If it is None, the nodes of all hosts are printed.
     """
     from flexsheet.launch.plans.needed_nodes import REASON_TEXTS
 
@@ -184,9 +187,10 @@ async def run_graph(
 ) -> int:
     """Run a graph until a signal arrives, and return the exit code.
 
-    The second signal logs the nodes that have not exited, and the third signal kills these nodes.
+    If a second signal arrives, the function logs the nodes that have not exited. If a third signal
+    arrives, it kills these nodes.
 
-    duration_s: maximum time after all nodes are ready; None for no limit.
+    duration_s: maximum time after all nodes are ready. If it is None, the time is not limited.
     without: names of nodes that are not started.
     when_ready: function that is called when all nodes are ready.
     """

@@ -35,16 +35,16 @@ FORMER_NAMES = {
     "service": "systemd",
     "stand-down": "disable",
 }
-"""The current names of renamed options and commands, by former name.
+"""The current name of each renamed option or command.
 
-The former names still work, but the help does not show them.
+The keys are the former names. They still work, but the help does not show them.
 """
 
 
 def make_app(text: str | None = None) -> typer.Typer:
     """Create the typer app of a single command, or of a command group with a help text.
 
-    text: help of the group; None for a single command.
+    text: help of the group. It is None for a single command.
     """
     return typer.Typer(add_completion=False, no_args_is_help=text is not None, help=text)
 
@@ -75,7 +75,10 @@ SCENE: dict[str, Any] = {
     "autocompletion": complete.scenes,
     "callback": find_scene,
 }
-"""The settings that all arguments and options for launch files or for scenes have in common."""
+"""The settings that all arguments and options for a scene have in common.
+
+LAUNCH_FILE contains the corresponding settings for a launch file.
+"""
 
 _LAUNCH_HELP = "Path of a launch file, or name of one in the package, such as demo."
 _SCENE_HELP = "Path of a scene file, or name of one in the package, such as cylinder."
@@ -230,7 +233,10 @@ def check_folder(file: Path | None) -> Path | None:
 
 
 def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
-    """Return the values of the option --set, preceded by the setting for the option --scene."""
+    """Return the values of the option --set.
+
+    If the option --scene is given, the setting of the scene precedes these values.
+    """
     return [*([] if scene is None else [f"scene={scene}"]), *(settings or ())]
 
 

@@ -54,7 +54,7 @@ class Words:
 
     @property
     def is_terminal(self) -> bool:
-        """Whether stderr is a terminal whose last lines can be replaced, not a dumb terminal."""
+        """Return whether stderr is a terminal in which printed lines can be replaced."""
         return self.console.is_interactive
 
     @property
@@ -127,7 +127,7 @@ def print_columns(
 ) -> None:
     """Print a table with selected values of the rows; None is shown as "-".
 
-    columns: key and format of the values in each column, by heading.
+    columns: for each heading, the key and the format of the values in the column.
     """
     print_table(
         list(columns),
@@ -194,9 +194,9 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
 
 
 SHOWN_UNITS = {"m": (1e3, "mm"), "m/N": (1e6, "µm/N"), "rad": (math.degrees(1.0), "°")}
-"""The factor and the unit of printed values, by SI unit.
+"""The factor by which printed values in an SI unit are multiplied, and the printed unit.
 
-Values in other units are not converted.
+The keys are SI units. Values in other units are not converted.
 """
 
 
@@ -298,7 +298,7 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
 
 
 def logs_on_stderr() -> None:
-    """Write the warnings and errors in the log of a command to stderr.
+    """Direct the log of a command, which contains warnings and errors, to stderr.
 
     By default, structlog writes to stdout, which is reserved for results. Call this function before
     any logger is created.

@@ -124,7 +124,7 @@ def set_parameter(
         live = ", ".join(f"{node.name}.{one}" for one in sorted(_live(node))) or "none"
         raise CommandError(
             f"{parameter}: this parameter cannot change while the node runs; start the graph again "
-            f"with --set {parameter}={value} (parameters that may change: {live})"
+            f"with --set {parameter}={value} (parameters that can change: {live})"
         )
     try:
         parsed = parse_value(value)
@@ -170,11 +170,10 @@ def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, d
 async def _await_statuses(
     plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
 ) -> int:
-    """Store the changed parameters in `found` until `done` returns True.
+    """Wait for statuses of nodes until `done` returns True, and store the changed parameters.
 
-    The parameters are stored by node and name.
-
-    Returns 0, or 1 on a timeout.
+    The parameters are stored in `found` by node name and parameter name. Returns 0, or 1 on a
+    timeout.
     """
 
     def add(status: Status) -> None:

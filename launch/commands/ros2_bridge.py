@@ -79,7 +79,10 @@ def ros2_bridge(
     for name in names:
         find_topic(name)
         if name not in plan.writers:
-            raise CommandError(f"--topic {name}: the topic has no writer in the running graph")
+            raise CommandError(
+                f"--topic {name}: the topic has no writer in the running graph; "
+                "`flexsheet topic list` lists its topics"
+            )
     if domain is None:
         given = os.environ.get("ROS_DOMAIN_ID", "0")
         if not given.isdigit() or int(given) > MAX_DOMAIN:

@@ -20,7 +20,7 @@ app = make_app("List the keys of scene files, and export a scene to other tools.
 
 
 SUFFIXES = {".urdf": "urdf", ".xml": "urdf", ".gltf": "gltf", ".glb": "gltf"}
-"""The format of an exported model by the suffix of the file name."""
+"""The format of an exported model for each suffix of the file name."""
 
 
 @app.callback()

@@ -164,7 +164,7 @@ def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def describe_output(port: dict[str, Any]) -> str:
-    """Return the topic of an output port and, for a periodic topic, its rate.
+    """Describe an output port by its topic and, if the topic is periodic, by its message rate.
 
     port: statistics of the port in a node's status.
     """
@@ -205,7 +205,10 @@ def logs(
     run: options.RunOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Print the log of a node of the running graph, or of the newest run if none is running."""
+    """Print the log of a node of the running graph.
+
+    If no graph is running, the log is taken from the newest run.
+    """
     from flexsheet.launch.plans.documents import did_you_mean
 
     found = _newest_run(run)

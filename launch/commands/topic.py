@@ -50,7 +50,7 @@ WindowOption = Annotated[
     typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
 ]
 REPORT_DELAY_S = 3.0
-"""The time without a message, in seconds, after which the command reports that none has arrived."""
+"""The time (s) after which the command reports that no message has arrived."""
 
 SHORT_ARRAY = 36
 """The maximum number of elements of an array that is printed completely."""
@@ -70,9 +70,9 @@ def list_topics(
 ) -> None:
     """List the topics that have a writer or a reader in the running graph.
 
-    Without a running graph, all defined topics are listed. The expected rate is a fixed range for
-    health checks, or "on change" for a topic without one. `flexsheet topic hz TOPIC` measures the
-    rate in the running graph.
+    If no graph is running, all defined topics are listed. The expected rate is the range of rates
+    that health checks accept, or "on change" if the topic has no such range. `flexsheet topic hz
+    TOPIC` measures the rate in the running graph.
     """
     from flexsheet.messages.topics import TOPICS
 
@@ -310,7 +310,7 @@ def _by_writer(arrivals: Sequence[Arrival]) -> list[list[Arrival]]:
 
 
 def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the rate, lost messages and publication intervals (ms), with one row per writer."""
+    """Return one row per writer with the rate, lost messages and publication intervals (ms)."""
     import numpy as np
 
     rows = []
@@ -333,7 +333,7 @@ def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the bandwidth (bytes per second) and the message sizes, with one row per writer."""
+    """Return one row per writer with the bandwidth (bytes per second) and the message sizes."""
     rows = []
     for own in _by_writer(arrivals):
         sizes = [one.size_bytes for one in own]
@@ -352,7 +352,7 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return statistics of the age (ms) of the data at arrival, with one row per writer."""
+    """Return one row per writer with statistics of the age (ms) of the data at arrival."""
     rows = []
     for own in _by_writer(arrivals):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
@@ -543,7 +543,9 @@ def _parse_message(topic: Topic, text: str) -> Message:
         try:
             text = Path(source).read_text()
         except OSError as error:
-            raise CommandError(f"{source}: cannot be read: {error.strerror}") from error
+            raise CommandError(
+                f"{source}: cannot be read: {error.strerror}; check the path"
+            ) from error
     try:
         try:
             value = parse_json(text)

@@ -41,7 +41,7 @@ def try_it(
     """Simulate the display, and touch a virtual object with the mouse in a web browser.
 
     The command starts the demo graph with a console, prints the address of the console page, and
-    runs until Ctrl-C. To open the page on another computer, first run there: ssh -L
+    runs until Ctrl-C. To open the page on another computer, first run this command there: ssh -L
     8080:127.0.0.1:8080 THIS_COMPUTER
     """
     from flexsheet.launch.plans.plan import load_graph

@@ -41,7 +41,7 @@ def tune(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Method family to tune; repeat the option for several; default: all.",
+            help="Method family to tune; repeat the option for several families; default: all.",
             autocompletion=complete.tuned_families,
         ),
     ] = None,
@@ -82,8 +82,8 @@ def tune(
     This takes seconds to minutes. Then the command predicts the errors of combined methods, and
     tests the fastest promising configuration in a graph. A configuration is accepted if it meets
     all tolerances, including the tolerances of latency and force. If --family is given, the command
-    chooses only the methods of these families, and chooses each one separately. Nodes use the
-    chosen method if their parameter is `auto`. The exit code is 3 if a tolerance is not met.
+    chooses methods only for these families, and treats each family separately. Nodes use the chosen
+    method if their parameter is `auto`. The exit code is 3 if a tolerance is not met.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune

@@ -47,7 +47,7 @@ def view(
 
     In the viewer, open a connection of the type "Foxglove WebSocket" with the printed address, and
     import the printed layout file. The server is read-only and accepts only connections from this
-    computer. To use a viewer on another computer, first run there:
+    computer. To use a viewer on another computer, first run this command there:
     ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER
     """
     try:
@@ -75,7 +75,10 @@ def view(
 async def _serve(
     make_server: Callable[[], LiveServer], port: int, duration_s: float | None, as_json: bool
 ) -> int:
-    """Serve viewers until the duration has passed, or without limit, and return the exit code 0."""
+    """Serve viewers until the duration has passed, and return the exit code 0.
+
+    If `duration_s` is None, the time is not limited.
+    """
     from flexsheet.launch.viewing.live_server import ADDRESS
 
     try:

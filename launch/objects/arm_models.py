@@ -75,7 +75,7 @@ def load_arm_models(document: Document) -> None:
 def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
     """Read the chain of six rotary joints between two links of a URDF file.
 
-    start_rad: start angles of the joints, with which the arm reaches towards the sheet.
+    start_rad: start angles of the joints, at which the arm reaches towards the sheet.
 
     Raises UrdfError if the file does not describe such a chain.
     """

@@ -37,7 +37,7 @@ MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
 """The names of shapes that scene files can contain.
 
-A scene file refers to a mesh by a file name, and does not contain its arrays.
+A scene file refers to a mesh by a file name, and does not contain the arrays of the mesh.
 """
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
@@ -105,7 +105,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     The repairs merge duplicate vertices, remove degenerate triangles, duplicate triangles and
     unused vertices, and orient the triangles outwards. `Mesh.origin` lists the repairs.
 
-    smoothing_m: smoothing length of the surface; None for the default.
+    smoothing_m: smoothing length of the surface. If it is None, the default is used.
 
     Raises MeshError if the mesh has holes or other faults that cannot be repaired.
     """

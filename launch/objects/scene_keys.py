@@ -16,7 +16,7 @@ from flexsheet.messages.scene import Lens, Mesh, Pose, Scene
 from flexsheet.messages.units import find_unit
 
 LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
-"""The types that the list contains only once."""
+"""The types whose keys have a group of their own, because several other types contain them."""
 
 EFFECTS: Mapping[str, str] = {
     "name": "name in logs, bags and reports",
@@ -81,11 +81,11 @@ EFFECTS: Mapping[str, str] = {
     "cy_px": "principal point in y",
     "distortion": "Brown's coefficients k1, k2, p1, p2, k3 in OpenCV's convention",
 }
-"""The effects of keys whose fields do not describe them sufficiently."""
+"""The effects of keys that the message types do not describe sufficiently."""
 
 
 class SceneKey(NamedTuple):
-    """A row of the reference of scene files; `type` and `effect` are Markdown."""
+    """A row in the reference table of scene files; `type` and `effect` are Markdown."""
 
     key: str
     type: str
@@ -96,7 +96,10 @@ class SceneKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class KeyGroup:
-    """A group of keys with a heading; a variant is one of the types of a shape or a support."""
+    """A group of keys with a heading.
+
+    is_variant: whether the keys describe one of several possible shapes or supports.
+    """
 
     title: str
     about: str
@@ -120,7 +123,10 @@ def list_groups() -> Iterator[KeyGroup]:
 
 
 def _variants(key: str, kind: type[BaseModel]) -> Iterator[KeyGroup]:
-    """Yield a group for each type that the key of the object can have."""
+    """Yield a group of keys for each type that the value of a key of the object can have.
+
+    key: "geometry" or "support".
+    """
     field = kind.model_fields[key]
     for variant in get_args(field.annotation):
         if variant is NoneType:
@@ -172,7 +178,10 @@ def _default(field: FieldInfo) -> str:
 
 
 def _single_model(annotation: Any) -> type[BaseModel] | None:
-    """Return the model type of an annotation `Model` or `Model | None`; None for others."""
+    """Return the model type of an annotation `Model` or `Model | None`.
+
+    Returns None for all other annotations.
+    """
     if get_origin(annotation) is Annotated:
         return None
     kinds = [one for one in (annotation, *get_args(annotation)) if isinstance(one, type)]

@@ -24,7 +24,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_SIDE_PX = 2048
 """The maximum width and height of a texture image, in pixels.
 
-The projected image has fewer pixels.
+More pixels would not improve the projected image, which has fewer pixels than this maximum.
 """
 
 

@@ -34,9 +34,9 @@ TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
 COMMISSION_STATE = "commission.json"
-"""The name of the file that names the original scene.
+"""The name of the state file of a commissioning, in the folder of the calibrated scene.
 
-The file is in the folder of a calibrated scene.
+The file names the scene from which the commissioning started.
 """
 
 PROFILES = tuple(one.value for one in Profile)
@@ -76,8 +76,7 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
     """Read an apparatus from a file, or sample a random apparatus from a text such as "seed:7".
 
     scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
-        sampled relative to the original scene, in the world frame of the camera. The original scene
-        is the scene before commissioning.
+        sampled relative to the scene before commissioning, in the world frame of the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
@@ -102,9 +101,9 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
 
 
 def _load_base(scene_file: Path | None) -> Scene | None:
-    """Load the scene as it was before commissioning.
+    """Load the scene from which the commissioning of a scene file started.
 
-    Return None if the file does not result from commissioning.
+    Return None if the file does not result from a commissioning.
     """
     state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
     if state is None or not state.is_file():
@@ -157,7 +156,7 @@ def give_apparatus(
 ) -> None:
     """Set the apparatus as a parameter of all simulator nodes.
 
-    Problems, for example an apparatus in the launch file, are stored in `document`.
+    Problems are stored in `document`. For example, a launch file must not contain an apparatus.
     """
     simulators = [one for one in entries if isinstance(one.parameters, SimulatorParameters)]
     for entry in simulators:
@@ -178,7 +177,8 @@ def give_apparatus(
 def refuse_apparatus_readers(entries: list[NodeEntry], document: Document) -> None:
     """Report a problem if a node other than simulators and recorders reads the apparatus topic.
 
-    Other nodes must not know the true parameters, because experiments measure their errors.
+    Experiments measure the errors of the other nodes, so these nodes must not know the true
+    parameters.
     """
     for entry in entries:
         if entry.type is None or find_role(entry.type) is NodeRole.RECORDER:

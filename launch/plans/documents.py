@@ -86,7 +86,7 @@ NUMBER_ERROR_TYPES = ("float_parsing", "float_type", "int_parsing", "int_type")
 """The types of pydantic errors for values that should be numbers."""
 
 Key = tuple[str | int, ...]
-"""A path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
+"""The path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class Document:
     overrides: dict[Key, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     extended: dict[Key, Path] = field(default_factory=dict)
-    """The source file of each key that was inherited from another file by `extend`."""
+    """The source file of each key that the method `extend` has inherited from another file."""
 
     def where(self, key: Key) -> str:
         """Return the location of `key` for error texts.
@@ -160,7 +160,7 @@ class Document:
         """Return the base folder of a relative path in the value of `key`.
 
         This is the folder of the file that contains `key`. If a command-line option overrides the
-        value, it is the current folder.
+        value, the current folder is returned.
         """
         if key in self.overrides:
             return Path.cwd()
@@ -220,7 +220,10 @@ class Document:
                 target[part] = {}
             if not isinstance(target[part], dict):
                 raise BadInputError.single(
-                    origin, key, f'"{part}" is not a mapping, so it contains no keys'
+                    origin,
+                    key,
+                    f'"{part}" is not a mapping, so it contains no keys',
+                    "correct the path of the key",
                 )
             target = target[part]
         target[key[-1]] = value
@@ -263,11 +266,11 @@ def _parse_tree(text: str) -> Any:
 
 
 def _check_size(text: str) -> None:
-    """Raise YAMLError if the parsing of a text would be too slow.
+    """Raise YAMLError if a text is so large or deeply nested that parsing takes too long.
 
-    The parsing time grows at least quadratically with the nesting depth. Tokens are counted before
-    parsing. They are not counted if there is so little punctuation that there can only be a few
-    tokens.
+    The parsing time grows at least quadratically with the nesting depth. The function therefore
+    counts tokens before the text is parsed. It skips the count if the punctuation marks are too few
+    to exceed the limits.
     """
     lines = text.splitlines()
     columns = max((len(line) - len(line.lstrip(" -?\t")) for line in lines), default=0)
@@ -326,7 +329,7 @@ def read_document(path: Path) -> Document:
         ) from error
     if len(text) > MAX_TEXT_LENGTH:
         what = f"the file has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
-        raise BadInputError.single(str(path), (), what)
+        raise BadInputError.single(str(path), (), what, "shorten the file")
     try:
         tree = _parse_tree(text)
         values = plain(tree)
@@ -422,9 +425,10 @@ def _name_type(value: Any) -> str:
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """Return a text that suggests the most similar known name, or else all known names.
+    """Return a text that suggests the known name that is most similar to `name`.
 
-    A known name that consists of the given name and a suffix, such as a unit, is preferred.
+    If no name is similar, the text lists all known names. If exactly one known name is `name` with
+    a suffix, such as a unit, this name is suggested.
     """
     longer = [one for one in known if one.startswith(f"{name}_")]
     near = longer if len(longer) == 1 else get_close_matches(str(name), known, n=1)
@@ -436,7 +440,7 @@ def did_you_mean(name: object, known: Sequence[str]) -> str:
 def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
     """Validate the values below the key `at` against a pydantic model, and return the model object.
 
-    Raises BadInputError with all problems.
+    Raises BadInputError if values are invalid. The error lists all problems.
     """
     values: Any = document.values
     for part in at:
@@ -485,7 +489,7 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 def _existing_part(document: Document, key: Key) -> Key:
     """Return the longest prefix of `key` that exists in the document.
 
-    `key` may be an error location from pydantic, which can contain names of types that are not keys
+    `key` can be an error location from pydantic, which can contain names of types that are not keys
     of the document.
     """
     values: Any = document.values
@@ -501,7 +505,7 @@ def _existing_part(document: Document, key: Key) -> Key:
 
 
 def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
-    """Return the new names of renamed keys by old name, for the mapping that contains `key`."""
+    """Return the new name of each renamed key in the mapping that contains `key`."""
     if key[0] == "nodes" and key[2:3] == ("parameters",):
         node_type = document.values["nodes"][key[1]].get("type")
         # A launch file may also give the class path of a shipped node as its type.
@@ -518,10 +522,8 @@ def _shorten(value: Any) -> str:
 def _walk(model: Any, location: Key) -> tuple[Key, Any]:
     """Convert the location of a pydantic error into a key of the file.
 
-    Also return the type of the value.
-
-    If the model is a union, the location also contains the name of the chosen member, which is not
-    a key of the file.
+    Also return the type of the value at this key. If a type is a union, the location also contains
+    the name of the chosen member, which is not a key of the file.
     """
     key: list[str | int] = []
     for part in location:
@@ -567,11 +569,9 @@ def _inner_type(annotation: Any, part: str | int) -> Any:
 
 @contextmanager
 def edit_yaml(source: Path, copy: Path) -> Iterator[Any]:
-    """Yield the tree of a YAML file.
+    """Yield the tree of a YAML file, so that the caller can change it.
 
-    When the context ends, the changed tree is written to `copy`.
-
-    Comments and layout are preserved.
+    When the context ends, the changed tree is written to `copy`. Comments and layout are preserved.
     """
     yaml = YAML(typ="rt", pure=True)
     yaml.width = 4096

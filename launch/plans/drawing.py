@@ -40,7 +40,7 @@ class Arrow:
 
     path: points of the SVG polyline, px.
     label_at: position of the label, px.
-    wire: label of a device connection; empty for topics.
+    wire: label of a device connection. It is empty if the arrow represents topics.
     """
 
     writer: str
@@ -129,7 +129,7 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign a column to each node, so that it is to the right of all nodes that write its inputs.
+    """Assign columns to nodes, so that each node is to the right of the writers of its inputs.
 
     links: pairs (writer, reader). Cycles are ignored.
     """

@@ -85,7 +85,7 @@ def load_keys(path: Path) -> dict[str, str]:
 
 
 def launcher_on(host: str) -> str:
-    """Return the writer name of the launcher on a host."""
+    """Return the name under which the launcher on a host publishes messages."""
     return LAUNCHER if host == MAIN else f"{LAUNCHER}_{host}"
 
 

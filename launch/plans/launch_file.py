@@ -29,7 +29,7 @@ A delay of the recorder affects no other node, because messages for the recorder
 CONSOLE_NICE = 10
 """The niceness of the console that the option --console adds.
 
-It is high, because the console must not delay other nodes.
+A process with high niceness has low priority, so the console does not delay other nodes.
 """
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
@@ -41,7 +41,7 @@ The path is relative to the working folder.
 MERGED_LEVELS = 4
 """The depth to which a launch file is merged with the file that it extends.
 
-At this depth are the keys nodes.NAME.parameters.KEY.
+The keys nodes.NAME.parameters.KEY are at this depth.
 """
 
 SCENE_KEY_SET = frozenset({"object", "sheet", "arms", "camera", "working_range"})
@@ -153,7 +153,8 @@ class LaunchFile(StrictModel):
 def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     """Read a launch file, and merge it with the files that it extends.
 
-    extending: files that extend this file, directly or indirectly, to detect circular references.
+    extending: files that extend this file directly or indirectly. They are needed to detect
+        circular references.
 
     Raises BadInputError if a file is invalid.
     """
@@ -240,7 +241,7 @@ def apply_setting(document: Document, setting: str) -> None:
 def apply_record(document: Document, bag: Path) -> None:
     """Set the bag file of the recorder, as the option --record does.
 
-    If there is no recorder, add one.
+    If the graph has no recorder, a recorder is added.
     """
     origin = f"--record {bag}"
     if bag.exists():

@@ -44,8 +44,9 @@ def omit_unneeded(
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
     """Return the nodes that are started, and the omitted nodes with the reasons for their omission.
 
-    A port is disconnected if the node does not use it with its parameters and this scene. If a node
-    of the graph publishes scenes, the scene is ignored, because a later scene can need more nodes.
+    A port is disconnected if the node's parameters and the scene make the port unnecessary. If a
+    node of the graph publishes scenes, the scene is ignored, because a later scene can need more
+    nodes.
 
     needed: topics that command-line tools read.
     external: topics that command-line tools write.

@@ -80,16 +80,17 @@ def load_graph(
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
-    settings: texts "node.parameter=value" with a YAML value, or "scene=FILE", which override the
-        file.
-    record: bag file that the recorder writes, instead of the file in the launch file.
-    console: whether to add a console and a paused recorder if the file does not contain them.
-    apparatus: true parameters of the simulated hardware, as a file or "seed:N"; None: the scene's
-        values are used.
-    needed: topics that the caller reads; their writers are started.
+    settings: texts "node.parameter=value" with a YAML value, or "scene=FILE". They override the
+        values of the launch file.
+    record: bag file that the recorder writes, instead of the bag file in the launch file.
+    console: whether to add a console and a paused recorder if the launch file does not contain
+        them.
+    apparatus: true parameters of the simulated hardware, as a file name or "seed:N". If it is None,
+        the scene contains the true parameters.
+    needed: topics that the caller reads. The nodes that write these topics are started.
     without: parts of the display that are omitted.
 
-    Raises BadInputError with all errors of the file.
+    Raises BadInputError, which lists all errors of the file, if the file is invalid.
     """
     document = read_launch_file(path)
     if record is not None:

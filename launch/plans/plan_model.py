@@ -20,7 +20,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole, OmissionReason, node_class
 
 MAIN = "main"
-"""The name of the host on which the launcher's topics, the recorder and command-line tools run."""
+"""The name of the main host, which runs the recorder and the command-line tools."""
 
 LAUNCHER, TOOLS = "launch", "tools"
 """The names under which the launcher and all command-line tools publish messages."""
@@ -38,13 +38,16 @@ ROLES_OF_TYPES = {
     "renderer": NodeRole.RENDERER,
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
-"""The roles of nodes by node type, for plans in older bags, which do not contain roles."""
+"""The role of each node type.
+
+The table is used for plans in older bags, which do not contain roles.
+"""
 
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
-"""The node parameters that name a calibration file, for plans in older bags.
+"""The node parameters that name a calibration file.
 
-These plans do not list calibrations.
+They are used for plans in older bags, which do not list calibrations.
 """
 
 
@@ -112,7 +115,7 @@ class Writer(StrictModel):
 class ResolvedPort(StrictModel):
     """A port of a node, with its topic and its endpoints.
 
-    An output port binds the endpoints. An input port reads them.
+    An output port binds the endpoints, and an input port connects to them.
     """
 
     port: str
@@ -121,7 +124,7 @@ class ResolvedPort(StrictModel):
 
 
 class ResolvedNode(StrictModel):
-    """The complete settings of a node for its start."""
+    """All settings that are needed to start a node."""
 
     name: str
     type: str
@@ -181,7 +184,10 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """A process and its nodes, with common niceness, restart policy and heartbeat timeout."""
+    """A process and its nodes.
+
+    The nodes have the same niceness, restart policy and heartbeat timeout.
+    """
 
     name: str
     nodes: tuple[ResolvedNode, ...]
@@ -197,7 +203,7 @@ class ResolvedProcess:
 
 
 class OmittedNode(StrictModel):
-    """A node of the launch file that is not started, with the reason."""
+    """A node of the launch file that is not started, and the reason for its omission."""
 
     name: str
     type: str
@@ -228,7 +234,7 @@ class ResolvedGraph(StrictModel):
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
-        """Return the writer `name` of a topic, or None if it is not allowed to write the topic."""
+        """Return the writer `name` of a topic; return None if the topic has no such writer."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
@@ -257,7 +263,7 @@ class ResolvedGraph(StrictModel):
     ) -> list[ResolvedProcess]:
         """Return the processes on `host`, in the order of their first nodes.
 
-        host: name of a host; None for all hosts.
+        host: name of a host. If it is None, the processes on all hosts are returned.
         without: names of nodes that are not started.
         """
         members: dict[str, list[ResolvedNode]] = {}
@@ -268,7 +274,10 @@ class ResolvedGraph(StrictModel):
         return [ResolvedProcess(name, tuple(nodes)) for name, nodes in members.items()]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
-        """Return (node name, TCP port) for each listening port of the nodes of a host."""
+        """Return the node name and the TCP port of each listening port on a host.
+
+        If `host` is None, the ports on all hosts are returned.
+        """
         return [(node.name, port) for node in self.nodes_on(host) for port in node.listen_ports]
 
     def scene_message(self) -> Scene | None:
@@ -279,5 +288,5 @@ class ResolvedGraph(StrictModel):
 
 
 def tools_on(host: str) -> str:
-    """Return the writer name of command-line tools on a host."""
+    """Return the name under which command-line tools on a host publish messages."""
     return TOOLS if host == MAIN else f"{TOOLS}_{host}"

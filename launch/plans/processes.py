@@ -17,8 +17,9 @@ COMMON_KEYS = ("host", "nice", "restart", "liveness_s")
 def check_processes(entries: list[NodeEntry], document: Document) -> None:
     """Report a problem if the nodes in one process are not allowed to share it.
 
-    Their process settings must be equal. An arm bridge (node that controls an arm) is only allowed
-    to share its process with the simulator of its arm, unless it sets `shares_arm_process`.
+    The process settings of the nodes must be equal. An arm bridge (node that controls an arm) is
+    only allowed to share its process with the simulator of its arm. The setting
+    `shares_arm_process` of the bridge permits other nodes.
     """
     names = {entry.name for entry in entries}
     processes: dict[str, list[NodeEntry]] = {}

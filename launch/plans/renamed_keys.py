@@ -48,7 +48,10 @@ SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """The new names of renamed keys of scene files, by former name."""
 
 REMOVED_KEYS = frozenset({"kinematics", "triangulation"})
-"""The removed keys of scenes and node parameters, for which only one value was left."""
+"""The keys of scenes and node parameters that were removed.
+
+They were removed because only one value was still possible.
+"""
 
 LAUNCH_KEYS: Mapping[str, str] = {
     "from_tools": "external_topics",

@@ -41,11 +41,11 @@ Other nodes have their parameters below the key `parameters`.
 
 
 class NodeEntry:
-    """A node of a launch file during its resolution.
+    """A node of a launch file, while the launch file is resolved.
 
     type, parameters: class and parameters of the node, which are None until they are resolved.
     ports: connected ports with their topics.
-    unconnected: unconnected ports with the topics of their type.
+    unconnected: unconnected ports, each with a topic to which the port could be connected.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -278,7 +278,11 @@ CALIBRATION_CHECKS: dict[
     ),
     ParameterMark.MARKER_CALIBRATION: (load_marker_calibration, refuse_other_marker),
 }
-"""The functions that load a calibration file and that reject a file for another scene."""
+"""The two functions that load and check each kind of calibration file.
+
+The first function loads the file. The second function rejects the calibration if it belongs to
+another scene.
+"""
 
 
 def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: Document) -> None:
@@ -302,8 +306,8 @@ def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: 
 def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
     """Return all parameters of a node as JSON values, including defaults.
 
-    resolve_paths: whether to make paths absolute; paths in the launch file are relative to its
-        folder.
+    resolve_paths: whether to make paths absolute. Otherwise, paths remain relative to the folder of
+        the launch file.
     """
     assert entry.parameters is not None  # otherwise the load has failed
     values = entry.parameters.model_dump(mode="json")

@@ -17,17 +17,19 @@ def list_shipped(folder: Path) -> list[str]:
 def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
     """Return the path of a YAML file that is given as a path or as the name of a shipped file.
 
-    shipped: folder of shipped files, LAUNCH_FILES or SCENES.
-    folder: base folder of a relative path. If no such file exists, the given path is returned.
+    If no such file exists, the given path is returned.
+
+    shipped: folder of the shipped files, which is LAUNCH_FILES or SCENES.
+    folder: base folder of a relative path.
     """
     path, named = folder / given, shipped / f"{given}.yaml"
     return named if not (path.exists() or path.suffix) and named.is_file() else path
 
 
 def name_shipped(given: str | Path, shipped: Path) -> str:
-    """Return a remedy for a file that does not exist, with the names of the shipped files.
+    """Return the remedy for a missing file: a text with the names of the shipped files.
 
-    shipped: folder of shipped files, LAUNCH_FILES or SCENES.
+    shipped: folder of the shipped files, which is LAUNCH_FILES or SCENES.
     """
     names = list_shipped(shipped)
     near = get_close_matches(Path(given).stem, names, n=1)

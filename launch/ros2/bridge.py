@@ -1,8 +1,8 @@
 """Bridge a running graph to ROS 2: publish its topics over DDS, and accept external inputs.
 
 The bridge has the permissions of a command-line tool. It is allowed to read all topics of the
-graph, and to write the topics that tools are allowed to write. External messages have the writer
-name of command-line tools.
+graph, and to write the topics that tools are allowed to write. External messages are published in
+the graph under the name of the command-line tools.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Ros2Bridge:
     """A bridge between one running graph and one participant of DDS, the middleware of ROS 2.
 
     topics: flexsheet topics to publish.
-    accept: topics to accept from ROS nodes (keys of `INPUTS`).
+    accept: flexsheet topics for which messages of ROS nodes are accepted (keys of `INPUTS`).
     noise_m: standard deviation of external fingertip positions.
     published, accepted: numbers of messages by topic.
     on_problem: function that is called with the text of an error.

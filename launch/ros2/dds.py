@@ -23,7 +23,7 @@ from flexsheet.launch.ros2.mapping import RosTopic, load_ros_types
 LOOPBACK = "lo"
 MAX_DOMAIN = 232
 MAX_PARTICIPANTS = 120
-"""The maximum number of DDS participants that find each other if multicast is disabled."""
+"""The maximum number of DDS participants that can find each other if multicast is disabled."""
 
 WAIT_S = 0.2
 BLOCKING_S = 0.1
@@ -45,8 +45,8 @@ def mangle_type(name: str) -> str:
 def make_configuration(interface: str) -> str:
     """Return the XML configuration of Cyclone DDS for one network interface.
 
-    For the loopback interface, multicast is disabled. Raises Ros2Error if this computer has no such
-    interface.
+    If the interface is the loopback interface, multicast is disabled. Raises Ros2Error if this
+    computer has no such interface.
     """
     if interface not in psutil.net_if_addrs():
         names = ", ".join(sorted(psutil.net_if_addrs()))
@@ -222,10 +222,12 @@ class RosParticipant:
 
 
 def _make_qos(topic: RosTopic) -> Any:
-    """Return the DDS quality of service: reliable, and transient local if the topic is latched.
+    """Return the DDS quality of service of a ROS topic.
 
-    A reliable writer is compatible with reliable and with best-effort readers. If the hash of the
-    type were missing, ROS 2 Iron and later releases would print a warning.
+    The communication is reliable. If the topic is latched, readers that connect later also receive
+    the last message. A reliable writer is compatible with reliable and with best-effort readers.
+    The user data contain the hash of the type, because ROS 2 Iron and later releases print a
+    warning if the hash is missing.
     """
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration

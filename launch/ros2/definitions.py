@@ -4,8 +4,8 @@ A message type or a group of fields becomes a ROS type of the same name. Fields 
 
     bool, int, float, text              bool, int64, float64, string
     timestamp                           builtin_interfaces/Time
-    array with at most one named axis   flat sequence or array of its elements, row by row
-    value that may be None              sequence with no or one element
+    array                               flat sequence or array of its elements, row by row
+    value that can be None              sequence with at most one element
     tuple of values of one type         sequence of the values
     anything else (such as a choice between several types)    string that contains JSON
 
@@ -32,13 +32,16 @@ from flexsheet.messages.field_types import get_annotation, is_image, split_annot
 
 PACKAGE = "flexsheet_msgs"
 HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
-"""The first fields of all generated ROS message types. `writer` is the publishing node."""
+"""The first fields of all generated ROS message types.
+
+The field `writer` contains the name of the node that published the message.
+"""
 
 ELEMENTS = {"<f8": "float64", "<f4": "float32", "<i4": "int32", "<i8": "int64", "|u1": "uint8"}
 """The ROS element types of array fields, by NumPy element type."""
 
 Make = Callable[..., Any]
-"""The type of a function that makes a ROS message from its type name and its fields (keywords)."""
+"""The type of a function that makes a ROS message from a type name and fields (keywords)."""
 
 
 class Ros2Error(FlexsheetError, RuntimeError):
@@ -78,7 +81,10 @@ def ros_name(kind: type[BaseModel]) -> str:
 
 @cache
 def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
-    """Return the ROS fields of a message type or group in order of declaration; omit images."""
+    """Return the ROS fields of a message type or a group of fields, in the order of declaration.
+
+    Images are omitted.
+    """
     stamps = find_stamp_fields(kind) if issubclass(kind, Message) else ()
     fields = []
     for name, info in kind.model_fields.items():
@@ -109,7 +115,7 @@ def make_definitions(kinds: Iterable[type[Message]]) -> dict[str, str]:
 def convert_fields(value: BaseModel, make: Make) -> dict[str, Any]:
     """Convert the fields of a message or group to ROS values, by field name.
 
-    make: function that makes a ROS message from type name and fields.
+    make: function that makes a ROS message from a type name and fields.
     """
     return {
         one.name: one.convert(getattr(value, one.name), make) for one in list_fields(type(value))
@@ -135,7 +141,7 @@ def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
 
 
 def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
-    """Return the ROS type of a Python annotation, and a function that converts its values."""
+    """Return the ROS type for a Python annotation, and a function that converts values to it."""
     annotation, spec = split_annotation(annotation)
     if spec is not None:
         return _describe_array(spec)
@@ -160,7 +166,7 @@ def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
 def _describe_sequence(
     item: Any, suffix: str, split: Callable[[Any], tuple[Any, ...]]
 ) -> tuple[str, Callable[[Any, Make], Any]]:
-    """Return the ROS type of a sequence, and a function that converts its values.
+    """Return the ROS type of a sequence, and a function that converts values to this type.
 
     item: annotation of an element.
     suffix: array part of the ROS type, such as "[]".

@@ -1,11 +1,13 @@
 """Map topics of flexsheet to topics of ROS 2, for exported bags and for the live bridge.
 
-`VIEWS` lists the ROS topics with standard types. In addition, each topic is published with all
-fields except images as `flexsheet/TOPIC`, with a type that the module `definitions` generates.
+`VIEWS` lists the ROS topics with standard types. In addition, each topic is published as
+`flexsheet/TOPIC` with all fields except images. The module `definitions` generates the types of
+these messages.
 
-Children of the frame `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`,
-`right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`. The measured
-flanges have their own names, because a robot model in ROS computes flanges from joint angles.
+The frame `world` has the following child frames: `object`, `camera_left`, `camera_right`,
+`projector`, `left_base`, `right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`,
+`fingertip`. The measured flanges have their own names, because a robot model in ROS computes
+flanges from joint angles.
 """
 
 from __future__ import annotations
@@ -133,8 +135,8 @@ class Source:
 
     topic: topic of the message.
     at_ns: source timestamp of the message, ns since 1970.
-    scene, skin: latest messages with the scene and the surface of the soft body; None before the
-        first message.
+    scene, skin: latest messages with the scene and the surface of the soft body. They are None
+        before the first message.
     flanges: latest flange poses (4, 4) by side.
     """
 
@@ -146,7 +148,10 @@ class Source:
     flanges: dict[Side, Floats]
 
     def stamped(self, kind: str, name: str, value: Any, frame: str = WORLD) -> Any:
-        """Make a ROS message of the type `kind` with the field `name` and a header."""
+        """Make a ROS message of the type `kind` with a header.
+
+        value: value of the field `name`.
+        """
         header = self.ros.header(self.at_ns, frame)
         return self.ros.make(kind, **{"header": header, name: value})
 
@@ -295,7 +300,7 @@ FORCE_DIRECTIONS = {
     "left_edge": (1.0, 0.0, 0.0),
     "right_edge": (-1.0, 0.0, 0.0),
 }
-"""The direction (3,), in the sheet's frame, of a positive measured force, by sensor axis."""
+"""The direction (3,) of a positive force, in the frame of the sheet, for each sensor axis."""
 
 
 def _measured_force(force: Force, source: Source) -> Any | None:
@@ -405,9 +410,9 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
 def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
     """Return the corners (4, 3), in m, of a flat sheet between both clamped edges.
 
-    The order is lower left, upper left, lower right, upper right.
+    The order of the corners is lower left, upper left, lower right, upper right.
 
-    flanges: poses (4, 4) by side.
+    flanges: flange pose (4, 4) of each arm, by side.
 
     Returns None if the scene or an arm is unknown.
     """
@@ -523,7 +528,7 @@ VIEWS = (
 
 @cache
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
-    """Return the ROS topics for a flexsheet topic, with their views.
+    """Return the ROS topics for a flexsheet topic, each with the view that makes its messages.
 
     Topics with standard types come first. The last topic contains all fields and has no view.
     """
@@ -559,7 +564,7 @@ class Converter:
     ) -> Iterator[tuple[RosTopic, Any]]:
         """Convert a message, and yield pairs of a ROS topic and a ROS message.
 
-        shift_ns: difference between the time since 1970 and the clock of the header.
+        shift_ns: offset that converts the header's timestamps to the time since 1970.
         wanted: function that returns whether messages of a ROS topic are needed.
         """
         match message:

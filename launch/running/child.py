@@ -12,7 +12,7 @@ from pathlib import Path
 
 PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
-"""The environment variable with the file descriptor of the lifeline.
+"""The environment variable that contains the file descriptor of the lifeline.
 
 The lifeline is a pipe to which nothing is written. A read from the pipe returns when the launcher
 exits.
@@ -21,7 +21,7 @@ exits.
 NICE_VARIABLE = "FLEXSHEET_NICE"
 
 AUTOGROUP = Path("/proc/self/autogroup")
-"""The file with the niceness of the session of this process.
+"""The file that contains the niceness of this process's session.
 
 Linux distributes processor time among sessions, and each node has its own session. The niceness of
 a node's process alone therefore has little effect.
@@ -30,8 +30,7 @@ a node's process alone therefore has little effect.
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
 """The number of attempts to write AUTOGROUP, and the time (s) between two attempts.
 
-If the processes have no privileges, the kernel accepts only one write per 0.1 s from all of them
-together.
+The kernel accepts only one write per 0.1 s from all unprivileged processes together.
 """
 
 GRACE_S = 3.0

@@ -23,9 +23,9 @@ UNTRACKED = "??"
 def read_git_state(directory: Path) -> str:
     """Return a JSON text with the git commit of the code, and whether files have changed.
 
-    The keys of the JSON object are `commit` and `changed`. Outside a git repository, `commit` is
-    the value of the environment variable that COMMIT_VARIABLE names, or null. Outside a git
-    repository, `changed` is null.
+    The keys of the JSON object are `commit` and `changed`. If the code is not in a git repository,
+    `changed` is null. The value of `commit` is then taken from the environment variable that
+    COMMIT_VARIABLE names, or is null.
 
     directory: root of the repository.
     """

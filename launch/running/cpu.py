@@ -18,7 +18,7 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""The maximum fraction of time that a node waits for a core if the computer is not overloaded."""
+"""The maximum fraction of time that a node can wait for a core on a computer without overload."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
@@ -64,12 +64,12 @@ class CpuWatch:
     ) -> CpuPressure | None:
         """Return the name and waiting time of the node that waited longest for the processor.
 
-        The waiting time is measured over the last WINDOW_S. Returns None if no waiting time is
-        known.
+        The waiting time is measured over the last WINDOW_S seconds. Returns None if no waiting time
+        is known.
 
         watched: process ids of the measured nodes by node name.
-        named: process ids, by node name, of the nodes that are reported by name; None: the nodes in
-            `watched`.
+        named: process ids of the nodes whose programs are reported by node name. If it is None,
+            these are the nodes in `watched`.
         measure_programs: whether to list the running programs even if the computer is not
             overloaded.
         """
@@ -98,7 +98,10 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return the total waiting time (s) of the main thread of a process, or None if unknown."""
+        """Return the total waiting time (s) of the main thread of a process.
+
+        Returns None if the time is unknown.
+        """
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:
@@ -108,7 +111,7 @@ class CpuWatch:
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
         """Return the programs that have used the most processor time since the last call.
 
-        Return no programs if the last call was more than WINDOW_S ago.
+        The result is empty if the last call was more than WINDOW_S seconds ago.
 
         named: process ids by node name.
         """

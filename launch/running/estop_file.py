@@ -38,7 +38,7 @@ class EStopFile:
         self.path = directory() / f"estop-{host}-{digest}.json"
 
     def read(self) -> EStop | None:
-        """Return the stored e-stop, or None if there is none.
+        """Return the stored e-stop, or None if no e-stop is stored.
 
         If the file cannot be read, return an e-stop.
         """

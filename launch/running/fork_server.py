@@ -46,9 +46,9 @@ READY_S = 20.0
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _ARGUMENTS_START, _ARGUMENTS_END = 45, 46
-"""The indices of the fields with the address range of the arguments in /proc/PID/stat.
+"""The indices of two fields of /proc/PID/stat, which contain the address range of the arguments.
 
-The indices count from the field after the program's name. See proc(5).
+The field after the program's name has the index 0. See proc(5).
 """
 
 
@@ -65,7 +65,7 @@ class ForkedProcess:
     def wait(self) -> int:
         """Wait for the end of the process, and return its exit code.
 
-        If a signal ended the process, return minus the number of the signal.
+        If a signal ended the process, the exit code is the negative number of the signal.
         """
         if self.returncode is None:
             _, status = os.waitpid(self.pid, 0)
@@ -78,7 +78,7 @@ class ForkServer:
 
     node_types: types of the nodes. If a type is defined outside this package, its module is not
         imported, because the module could start threads.
-    config_files: files of all processes that may be started.
+    config_files: configuration files of all processes that can be started.
     lifeline: file descriptor that the nodes inherit.
     log: file for the server's own output.
     """
@@ -144,8 +144,8 @@ class ForkServer:
 
         config_file: configuration of the process.
         output: descriptor for standard output and error.
-        ready: descriptor for the report that the nodes are ready. The configuration names it, and
-            it has the same number in the new process.
+        ready: descriptor for the report that the nodes are ready. The configuration contains the
+            number of this descriptor, so the new process uses the same number.
         """
         changed = {
             name: value
@@ -242,8 +242,8 @@ def _import_nodes(types: Iterable[str]) -> None:
 def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
     """Fork a process, and make the launcher its parent.
 
-    Returns True in the new process, and False in the fork server. The new process ends if the
-    launcher has not received the id of the new process.
+    Returns True in the new process, and False in the fork server. If the launcher does not receive
+    the id of the new process, the new process ends.
 
     descriptors: files that the process inherits.
     """
@@ -280,8 +280,8 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
 def _write_arguments(arguments: list[str]) -> None:
     """Replace the arguments of this process in /proc, because tools identify nodes by them.
 
-    An argument of spaces, before the last two arguments, fills the remaining space. Raises
-    ValueError if the space is too small.
+    The remaining space is filled with an argument of spaces, which precedes the last two arguments.
+    Raises ValueError if the space is too small.
     """
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     start, end = int(fields[_ARGUMENTS_START]), int(fields[_ARGUMENTS_END])

@@ -64,7 +64,7 @@ class HostAgent:
 
     The agent works between the calls of `start` and `close`.
 
-    code: git commit that `HostStatus` reports.
+    code: git commit of the running code, which is a part of the published status.
     pids: function that returns the process ids of the running nodes by node name.
     """
 
@@ -157,7 +157,7 @@ class HostAgent:
         return subscriber
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Replace the keys of all sockets by keys that were loaded again."""
+        """Replace the keys of all sockets by the newly loaded keys."""
         for publisher in self.publishers.values():
             publisher.renew_keys(change)
         for subscriber in self._subscribers:
@@ -376,7 +376,7 @@ def python_version() -> str:
 
 
 def software() -> str:
-    """Return one text with the versions of the libraries that should be equal on all hosts."""
+    """Return a text with the versions of libraries. The versions should be equal on all hosts."""
     try:
         own = version("flexsheet")
     except PackageNotFoundError:

@@ -42,7 +42,7 @@ def secret_file(host: str) -> Path:
 def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
     """Write the key ring files of a run, load them, and return the key rings by host.
 
-    host: host of the key ring file; None for all hosts.
+    host: host whose key ring file is written. If it is None, the files of all hosts are written.
 
     Raises BadInputError if a key is missing or invalid.
     """
@@ -73,9 +73,9 @@ class KeyWatch:
         self._read_ns = 0
 
     def read_changes(self) -> dict[str, KeyChange]:
-        """Update the key ring files, and return the key changes by host since the last call.
+        """Update the key ring files, and return the key changes of each host since the last call.
 
-        Raises BadInputError, SecurityError and OSError if a file cannot be read or is invalid.
+        Raises BadInputError, SecurityError or OSError if a file cannot be read or is invalid.
         """
         changed_ns = self._launch_file.stat().st_mtime_ns
         if changed_ns != self._read_ns:

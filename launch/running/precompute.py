@@ -31,7 +31,7 @@ class NoSoftBodyError(FlexsheetError, RuntimeError):
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
-    """Compute the tables that are not cached and that a graph's planners and renderers need."""
+    """Compute the tables that the graph's planners and renderers need and that are not cached."""
     scene = plan.scene_message()
     if scene is None:
         return
@@ -73,9 +73,10 @@ def precompute_deflection_shapes(
 
 
 def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
-    """Return a function (done, total) that reports the progress and the remaining time in steps.
+    """Return a function (done, total) that reports the progress and the remaining time.
 
-    If `total` changes, or `done` decreases, the reports start again.
+    The function reports in steps of 10 % of the total work. If `total` changes, or `done`
+    decreases, the reports start again.
 
     what: name of the computation in the reports.
     """
@@ -122,7 +123,7 @@ def precompute_soft_body(
     The table is computed if the file does not exist.
 
     skin_spacing_m: spacing of the nodes at the surface.
-    scheduler: address of a dask.distributed scheduler; None: the table is computed on this
+    scheduler: address of a dask.distributed scheduler. If it is None, the table is computed on this
         computer.
 
     Raises NoSoftBodyError if the scheduler cannot be used, the body cannot be meshed, or memory is

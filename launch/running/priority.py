@@ -15,7 +15,7 @@ CAP_SYS_NICE = 23
 
 
 def min_nice_step() -> int:
-    """Return the lowest change of niceness that is permitted for a child process."""
+    """Return the most negative change of niceness that is permitted for a child process."""
     own = os.getpriority(os.PRIO_PROCESS, 0)
     # The limit RLIMIT_NICE is 20 minus the minimum niceness: 25 permits a niceness of -5.
     soft_limit, _ = resource.getrlimit(resource.RLIMIT_NICE)
@@ -30,10 +30,10 @@ def _has_cap_sys_nice() -> bool:
 
 
 def min_node_nice() -> int:
-    """Return the minimum niceness that is permitted for a node.
+    """Return the minimum configured niceness that is permitted for a node.
 
-    This is the minimum that the user is permitted to set, or the niceness of this process if it is
-    lower.
+    This is the most negative change of niceness that the user is permitted to make. If the niceness
+    of this process is lower, it is returned instead.
     """
     return min(min_nice_step(), os.getpriority(os.PRIO_PROCESS, 0))
 
@@ -45,7 +45,10 @@ def list_denied(nodes: Sequence[ResolvedNode]) -> list[str]:
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Return a text about nodes whose niceness is not permitted, or None if there are none."""
+    """Return a text about the nodes whose niceness is not permitted.
+
+    Returns None if there are no such nodes.
+    """
     names = list_denied(nodes)
     if not names:
         return None

@@ -67,7 +67,7 @@ class Run:
 
     @property
     def host(self) -> str | None:
-        """Return the host whose nodes the run started, or None if it started all nodes."""
+        """Return the host whose nodes the run started, or None if it started all hosts' nodes."""
         try:
             return (self.directory / HOST_FILE).read_text()
         except FileNotFoundError:
@@ -97,7 +97,7 @@ def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Replace the placeholder of the run's directory in the endpoints of sources by the path."""
+    """Replace the placeholder of the run's directory in the endpoints of sources by its path."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(
@@ -168,7 +168,7 @@ def launcher_is_alive(run_id: str) -> bool:
 
 
 def find_orphans() -> list[psutil.Process]:
-    """Return this user's processes that exited launchers have left over."""
+    """Return this user's processes whose launchers have exited."""
     import psutil
 
     found = []

@@ -16,7 +16,7 @@ class ProcessorTime:
     run_s: time on a processor core.
     wait_s: time that the thread waited for a core. It includes only waits that ended before the
         thread last ran.
-    state: letter in /proc/PID/stat (R, S, D, T, ...).
+    state: letter of the thread's state in /proc/PID/stat, such as R (ready or running).
     """
 
     run_s: float

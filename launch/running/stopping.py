@@ -3,11 +3,13 @@
 All launchers and arm bridges (nodes that control an arm) on this computer have a socket for e-stops
 (`nodes.stop_socket`). The steps are:
 
-1. All sockets get the request simultaneously. A launcher stores the stop and publishes it to all
-hosts. A bridge stops its own arm. 2. Receivers that do not answer get SIGCONT, because they may be
-suspended. 3. If no launcher has answered, the bridges that do not answer are killed. The watchdogs
-of their arms then stop the arms. 4. If no receiver has answered, the nodes that send sheet targets
-are killed. If the bridges receive no targets, they stop their arms on all hosts.
+1. A request is sent to all sockets simultaneously. A launcher stores the stop and publishes it to
+   all hosts. A bridge stops its own arm.
+2. Receivers that do not answer get the signal SIGCONT, because they can be suspended.
+3. If no launcher has answered, the bridges that do not answer are killed. The watchdogs of their
+   arms then stop the arms.
+4. If no receiver has answered, the nodes that send sheet targets are killed. If the bridges receive
+   no targets, they stop their arms on all hosts.
 
 This module imports few other modules, so that the stop is sent without delay.
 """
@@ -119,8 +121,8 @@ If `send_early` was called, this list contains one list of attempts. Otherwise, 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
     """Engage the e-stop in the runs with these directories, and return all attempts.
 
-    The module docstring describes the steps. The function waits at most KILL_AFTER_S for answers
-    before it kills processes.
+    The steps are listed at the beginning of this module. The function waits at most KILL_AFTER_S
+    for answers before it kills processes.
     """
     started_s = time.monotonic()
     attempts: list[StopAttempt] = []
@@ -207,7 +209,10 @@ def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
 
 
 def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
-    """Kill the nodes of the runs that publish sheet targets, and return their names."""
+    """Kill the nodes that publish sheet targets in the given runs.
+
+    Returns the names of the killed nodes.
+    """
     killed = []
     for directory in directories:
         try:

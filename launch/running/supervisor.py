@@ -4,11 +4,11 @@
         await graph.wait_ready()
         ...
 
-Every process is a separate session. A process runs one node, or all nodes that name the same
-process in the launch file. It reports through a pipe that its nodes are ready. When it exits, its
-restart policy is applied. To stop a process, the launcher sends SIGINT, SIGTERM and finally
-SIGKILL. The launcher needs no threads. Its event loop learns from pidfds that processes have
-exited, and reads logs and readiness from pipes.
+Every process has its own session. A process runs one node, or all nodes that name the same process
+in the launch file. It reports through a pipe that its nodes are ready. When it exits, its restart
+policy is applied. To stop a process, the launcher sends SIGINT, SIGTERM and finally SIGKILL. The
+launcher needs no threads. Its event loop waits for process file descriptors (pidfds), which report
+the exit of a process, and for pipes with the logs and heartbeats of processes.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ STACK_DUMP_S = 0.5
 FORK_SERVER = "fork-server"
 LOG_READ_BYTES = 65_536
 GROUP_REAPS, GROUP_REAP_S = 20, 0.1
-"""The number of attempts to reap the child processes of a node, and the time (s) between them."""
+"""The number of attempts to reap the child processes of a node, and the time between them (s)."""
 
 Report = Callable[[str, str], None]
 """A function that is called with (node, line) for each log line.
@@ -257,7 +257,8 @@ class Child:
     def _reap(self) -> None:
         """Handle the exit of the process.
 
-        Its child processes are killed, the last output is read, and the pipes are closed.
+        The child processes of this process are killed, its last output is read, and its pipes are
+        closed.
         """
         if self.exited.done():
             return
@@ -314,7 +315,8 @@ def _start_python(
 class RunningGraph:
     """A supervisor of the processes that run the nodes of a graph.
 
-    host: host of the nodes to start; None: the nodes of all hosts are started on this computer.
+    host: host of the nodes to start. If it is None, the nodes of all hosts are started on this
+        computer.
     without: names of nodes that are not started.
     report: function that is called with (node, line) for every log line. The folder `run.logs` also
         contains all lines.
@@ -452,7 +454,7 @@ class RunningGraph:
     def _send(self, number: int, children: Collection[Child]) -> None:
         """Send a signal to processes.
 
-        If the signal is SIGKILL, bags that may become incomplete are reported first.
+        If the signal is SIGKILL, bags that can become incomplete are reported first.
         """
         for bag in self._list_open_bags(children) if number == signal.SIGKILL else ():
             self._report(
@@ -577,9 +579,8 @@ class RunningGraph:
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
         """Publish a message that later subscribers also receive.
 
-        Return the source timestamp (ns) of the message.
-
-        Returns None if there is no message, or if the launcher is not a writer of the topic.
+        Returns the source timestamp (ns) of the message. Returns None if there is no message, or if
+        the launcher is not a writer of the topic.
         """
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:
@@ -832,7 +833,7 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the scene file as JSON.
+        """Write each scene that is in the folder of the graph's scene file to `folder`, as JSON.
 
         Nodes that publish scenes read these files.
         """

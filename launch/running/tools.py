@@ -42,7 +42,7 @@ class ToolCounts:
 
 
 def tools_host(run: Run) -> str:
-    """Return the host of the command-line tools."""
+    """Return the name of the host on which the command-line tools of a run are used."""
     return run.host or MAIN
 
 
@@ -93,7 +93,7 @@ async def read_topic(
 
     If the caller is slow, messages wait in a queue.
 
-    count: number of messages; None for no limit.
+    count: number of messages. If it is None, the number is not limited.
 
     Raises KeyError if the topic does not exist.
     """
@@ -146,7 +146,7 @@ class GraphWriter:
     def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
         """Send a message with the next sequence number.
 
-        source_ns: source timestamp of the data; None: the present time.
+        source_ns: source timestamp of the data. If it is None, the present time is used.
         """
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
         now_ns = self._clock.now_ns()

@@ -1,9 +1,9 @@
 """Describe the arms, cameras, projector and sheet of a scene by links and joints, as in URDF.
 
-Links of each arm: `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`,
-where SIDE is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`, `projector`
-and `screen`. The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model contains only
-geometry, because masses and torques are unknown.
+Each arm has the links `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`,
+where SIDE is `left` or `right`. The other links are `world`, `camera_left`, `camera_right`,
+`projector` and `screen`. The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model
+contains only geometry, because masses and torques are unknown.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Joint:
     """A joint between two links.
 
     parent_from_child: pose (4, 4) of the child at joint angle zero.
-    limit: axis and range of a revolute joint; None for a fixed joint.
+    limit: axis and range of a revolute joint. It is None if the joint is fixed.
     """
 
     name: str
@@ -131,7 +131,7 @@ def make_model(scene: Scene) -> ApparatusModel:
 
 
 def solve_rest_joints(scene: Scene) -> dict[str, float]:
-    """Return the joint angles (rad), by name, of arms that hold the sheet at the screen.
+    """Return the joint angles (rad), by joint name, at which the arms hold the sheet at the screen.
 
     If an arm cannot reach the screen, each of its joint angles is the centre of the joint's range.
     """

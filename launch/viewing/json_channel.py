@@ -88,8 +88,8 @@ def _describe_type(kind: type) -> JsonSchema:
 def _merge(schemas: list[JsonSchema]) -> JsonSchema:
     """Return one JSON Schema for values of several types.
 
-    If all types have the same schema, it is returned. If all types are objects, the result has the
-    fields of all objects. Otherwise, it is the schema of an array or a text.
+    If all types have the same schema, this schema is returned. If all types are objects, the result
+    has the fields of all objects. Otherwise, the result is the schema of an array or a text.
     """
     if not schemas:
         return _TEXT

@@ -5,7 +5,8 @@ A topic of the graph becomes a JSON channel of the same name. The other channels
     tf                                   poses of links, sheet target and fingertip
     apparatus, sheet, object, finger     the 3D scene
     joint_states                         joint angles, named as in the URDF model
-    TOPIC/left, TOPIC/right, ...         images as JPEG; .../calibration of the stereo camera
+    TOPIC/left, TOPIC/right, ...         images as JPEG
+    TOPIC/left/calibration, ...          calibration of the stereo camera
     log                                  e-stops and notes of the nodes
 
 In the frame `viewer`, z points up, as viewers expect. In the frame `world`, y points up.
@@ -71,7 +72,7 @@ VIEWER_FROM_WORLD = transform(rotation_from_vector((0.5 * np.pi, 0.0, 0.0)), np.
 EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
 EYE_RADIUS_M = 0.011
 SHEET_STEP = 2
-"""The step between the rows and columns of the sheet's mesh that are sent to viewers."""
+"""The step with which rows and columns of the sheet's mesh are selected for viewers."""
 JPEG_QUALITY = 80
 
 
@@ -115,7 +116,10 @@ class LiveState:
         return found if isinstance(found, Fingertip) else None
 
     def edges(self) -> tuple[Floats, Floats] | None:
-        """Return the world poses (4, 4) of the left and right edge, or None if one is unknown."""
+        """Return the world poses (4, 4) of the sheet's left and right edge.
+
+        Returns None if a pose is unknown.
+        """
         scene, found = self.scene, []
         for side in get_args(Side):
             state = self.latest.get(f"arm_{side}")
@@ -132,9 +136,9 @@ class LiveChannel:
 
     topics: topics that the channel needs in addition to the scene.
     triggers: topics that cause the channel to send a message.
-    make: function (state, received message, timestamp) that returns a message of the channel, or
-        None if there is nothing to send.
-    kind: Foxglove type of the messages; empty for JSON.
+    make: function (state, received message, timestamp) that returns a message of the channel. It
+        returns None if there is nothing to send.
+    kind: Foxglove type of the messages. It is empty if the messages are JSON.
     schema: JSON Schema of JSON messages.
     """
 

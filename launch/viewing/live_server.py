@@ -1,4 +1,4 @@
-"""Serve a running graph to Foxglove and Lichtblick over their WebSocket protocol, read-only.
+"""Serve a running graph to Foxglove and Lichtblick over their WebSocket protocol.
 
 The server of the Foxglove SDK has no authentication and accepts requests from any web page.
 Therefore the server listens on the loopback interface only. Viewers cannot publish, call services
@@ -72,9 +72,9 @@ class ReadOnlyParameters(ServerListener):
 class LiveServer:
     """A server that sends the data of one running graph to viewers in a running event loop.
 
-    rate_hz, image_rate_hz: maximum rate per channel of numbers, and maximum rate per channel of
-        images and meshes.
-    port: TCP port; 0: a free port is selected.
+    rate_hz: maximum rate of a channel with numbers.
+    image_rate_hz: maximum rate of a channel with images or meshes.
+    port: TCP port. If it is 0, a free port is selected.
     on_problem: function that is called with the text of an error.
     """
 
@@ -203,6 +203,8 @@ class LiveServer:
         self, channel: LiveChannel, topic: str, message: Message | None, now_ns: int, source_ns: int
     ) -> None:
         """Send a message on a channel if the channel has viewers and its period has elapsed.
+
+        The period is the inverse of the channel's maximum rate.
 
         now_ns: present time.
         source_ns: timestamp of the message.

@@ -9,7 +9,7 @@ from flexsheet.launch.viewing.apparatus_model import ApparatusModel, Box, Joint,
 from flexsheet.nodes.models.rigid import rpy_from_rotation
 
 UNKNOWN_EFFORT = "0"
-"""The value of the required attribute `effort`: zero, because the torques are unknown."""
+"""The value of the required attribute `effort`. It is zero, because the torques are unknown."""
 
 
 def make_urdf(model: ApparatusModel) -> str:
