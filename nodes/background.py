@@ -1,10 +1,13 @@
-"""Lower the priority of processes that compute results for later use."""
+"""Set the priority of processes and threads: background computation, or real time."""
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 
 MAX_NICE = 19
+THREADS = "/proc/self/task"
+"""The folder with the thread IDs of this process."""
 
 
 def enter_background() -> None:
@@ -14,3 +17,21 @@ def enter_background() -> None:
     """
     os.setpriority(os.PRIO_PROCESS, 0, MAX_NICE)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def enter_real_time(priority: int) -> None:
+    """Give all threads of this process a real-time priority (policy SCHED_RR).
+
+    Threads and processes that are started later inherit it, so worker threads should call
+    `leave_real_time`. Raises PermissionError if the user may not set this priority.
+    """
+    for thread in os.listdir(THREADS):
+        # A thread may have ended since the folder was read.
+        with suppress(ProcessLookupError):
+            os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(priority))
+
+
+def leave_real_time() -> None:
+    """Give the calling thread the normal scheduling policy, if it inherited real-time priority."""
+    if os.sched_getscheduler(0) == os.SCHED_RR:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -15,6 +15,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -34,6 +35,7 @@ from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
 from flexsheet.nodes import node_class
+from flexsheet.nodes.background import enter_real_time, leave_real_time
 from flexsheet.nodes.log_limit import RepeatLimiter
 from flexsheet.nodes.node import Node, PortCounts, Timer, find_parameters_type, find_timers
 from flexsheet.nodes.signals import handle_signals
@@ -84,6 +86,7 @@ class ProcessConfig(BaseModel):
     """The configuration of a process and its nodes.
 
     ready_fd: file descriptor of a pipe to the launcher; None if there is no launcher.
+    realtime_priority: real-time priority when all nodes are ready; None if there is none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -91,6 +94,7 @@ class ProcessConfig(BaseModel):
     name: str
     nodes: tuple[NodeConfig, ...]
     ready_fd: int | None = None
+    realtime_priority: int | None = None
 
 
 class NodeTransport:
@@ -398,10 +402,13 @@ class Heartbeat:
 
     fd: write end of the pipe; None if there is no launcher. Writing never blocks.
     nodes: number of nodes in the process.
+    on_ready: function that is called when all nodes are ready.
     """
 
-    def __init__(self, fd: int | None, nodes: int = 1) -> None:
-        self._fd, self._starting = fd, nodes
+    def __init__(
+        self, fd: int | None, nodes: int = 1, on_ready: Callable[[], None] = lambda: None
+    ) -> None:
+        self._fd, self._starting, self._on_ready = fd, nodes, on_ready
         if fd is not None:
             os.set_blocking(fd, False)
 
@@ -410,6 +417,8 @@ class Heartbeat:
         launcher.
         """
         self._starting -= 1
+        if self._starting == 0:
+            self._on_ready()
         self.beat()
 
     def beat(self) -> None:
@@ -431,7 +440,7 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
 
     Raises LoggedNodeError for the first node that failed, after its error was logged.
     """
-    heartbeat = Heartbeat(config.ready_fd, len(config.nodes))
+    heartbeat = Heartbeat(config.ready_fd, len(config.nodes), partial(_prioritize, config))
     local = None
     if len(config.nodes) > 1:
         outputs = (output for node in config.nodes for output in node.outputs)
@@ -453,6 +462,15 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
     for result in results:
         if isinstance(result, BaseException):
             raise result
+
+
+def _prioritize(config: ProcessConfig) -> None:
+    """Enter real time after the start, so that imports and tables do not delay other programs."""
+    if config.realtime_priority is not None:
+        asyncio.get_running_loop().set_default_executor(
+            ThreadPoolExecutor(thread_name_prefix="asyncio", initializer=leave_real_time)
+        )
+        enter_real_time(config.realtime_priority)
 
 
 async def run_until_signal(config: ProcessConfig) -> None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
+from threading import Event, Thread
 
-from flexsheet.nodes.background import MAX_NICE, enter_background
+import pytest
+
+from flexsheet.launch.running import priority
+from flexsheet.nodes.background import MAX_NICE, enter_background, enter_real_time, leave_real_time
 from flexsheet.nodes.fem_solver.precompute_table import local_processes
 
 
@@ -37,3 +41,36 @@ def test_ctrl_c_does_not_interrupt_the_workers_of_a_soft_bodys_table() -> None:
 def test_workers_of_a_soft_bodys_table_are_background_processes() -> None:
     with local_processes(1) as workers:
         assert priority_in(workers) == (MAX_NICE, os.SCHED_BATCH)
+
+
+def policies_in_real_time() -> tuple[set[int], int, int]:
+    """Enter real time, and return the policies of threads.
+
+    The policies are those of all threads that existed before, and those of worker threads without
+    and with `leave_real_time`.
+    """
+    ended = Event()
+    Thread(target=ended.wait).start()
+    enter_real_time(1)
+    before = {os.sched_getscheduler(int(one)) for one in os.listdir("/proc/self/task")}
+    with ThreadPoolExecutor(1) as plain, ThreadPoolExecutor(1, "", leave_real_time) as normal:
+        inherited = plain.submit(os.sched_getscheduler, 0).result()
+        left = normal.submit(os.sched_getscheduler, 0).result()
+    ended.set()
+    return before, inherited, left
+
+
+@pytest.mark.skipif(not priority._may_set_real_time(1), reason="real time is not permitted")
+def test_real_time_applies_to_all_threads_except_workers_that_leave_it() -> None:
+    # Forked, so that the tests themselves keep their policy.
+    with ProcessPoolExecutor(1, get_context("fork")) as process:
+        before, inherited, left = process.submit(policies_in_real_time).result()
+    assert before == {os.SCHED_RR}
+    assert (inherited, left) == (os.SCHED_RR, os.SCHED_OTHER)
+
+
+def test_a_thread_without_real_time_keeps_its_policy() -> None:
+    with ThreadPoolExecutor(1) as worker:
+        worker.submit(os.sched_setscheduler, 0, os.SCHED_BATCH, os.sched_param(0)).result()
+        worker.submit(leave_real_time).result()
+        assert worker.submit(os.sched_getscheduler, 0).result() == os.SCHED_BATCH

@@ -408,6 +408,7 @@ def test_a_bridge_shares_its_process_with_its_own_simulator(tmp_path: Path) -> N
         (f'"{BEACON}"}}', f'"{BEACON}", process: arm}}', 'fault of "beacon" would stop the arm'),
         ("port: 5020", "port: 5022", 'fault of "twin_arms" would stop the arm of "bridge"'),
         ("process: arm}", "process: arm, nice: 3}", "set the same nice for both nodes"),
+        ("process: arm}", "process: arm, realtime_priority: 9}", "set the same realtime_priority"),
         ("process: arm}", "process: arm, host: left}", "set the same host for both nodes"),
         ("process: arm", "process: beacon", "is the name of another node"),
         ("process: arm", "process: plan", "or is reserved"),

@@ -28,7 +28,7 @@ from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs, supervisor
-from flexsheet.launch.running.priority import min_nice_step
+from flexsheet.launch.running.priority import find_real_time_priority, min_nice_step
 from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
 from flexsheet.messages.bag import BagReader
@@ -118,7 +118,23 @@ async def test_a_node_has_high_priority_if_the_user_may_raise_it(tmp_path: Path)
         assert psutil.Process(pid).nice() == own + max(-7, least)
         assert session_niceness(pid) in (None, max(-7, least))
         log = (graph.run.logs / "launch.log").read_text()
-        assert ("may not set nice below" in log) is (least > -7)
+        assert ("may not set the `nice`" in log) is (least > -7)
+
+
+async def test_a_ready_node_has_its_real_time_priority_if_the_user_may_set_it(
+    tmp_path: Path,
+) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(realtime_priority=7), listener=LISTENER)
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready()
+        granted = find_real_time_priority(7) is not None
+        pid = graph.pids["beacon"]
+        policies = {os.sched_getscheduler(int(one)) for one in os.listdir(f"/proc/{pid}/task")}
+        assert policies == {os.SCHED_RR if granted else os.SCHED_OTHER}
+        assert os.sched_getparam(pid).sched_priority == (7 if granted else 0)
+        assert os.sched_getscheduler(graph.pids["listener"]) == os.SCHED_OTHER
+        log = (graph.run.logs / "launch.log").read_text()
+        assert ("may not set the `nice` or `realtime_priority`" in log) is not granted
 
 
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:

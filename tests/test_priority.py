@@ -9,15 +9,24 @@ import pytest
 
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import child, priority
-from flexsheet.launch.running.priority import MIN_NICE, describe_nice_problem, min_nice_step
+from flexsheet.launch.running.priority import (
+    MIN_NICE,
+    describe_priority_problem,
+    find_real_time_priority,
+    min_nice_step,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = load_graph(ROOT / "launch" / "demo.yaml")
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, *, capable: bool, limit: int) -> None:
-    """Set whether the user has the capability, and the soft limit of niceness."""
+    """Set whether the user has the capability, and the soft limit of niceness.
+
+    Real-time priorities are permitted.
+    """
     monkeypatch.setattr(priority, "_has_cap_sys_nice", lambda: capable)
+    monkeypatch.setattr(priority, "_may_set_real_time", lambda wanted: True)
     monkeypatch.setattr(priority.resource, "getrlimit", lambda which: (limit, limit))
     monkeypatch.setattr(os, "getpriority", lambda which, who: 0)
 
@@ -44,7 +53,7 @@ def test_nodes_of_a_launcher_with_their_priority_lack_nothing(
     allow(monkeypatch, capable=False, limit=0)
     own = min(node.nice for node in DEMO.nodes.values())
     monkeypatch.setattr(os, "getpriority", lambda which, who: own)
-    assert describe_nice_problem(list(DEMO.nodes.values())) is None
+    assert describe_priority_problem(list(DEMO.nodes.values())) is None
 
 
 def test_a_missing_permission_for_priority_is_reported_once(
@@ -52,13 +61,43 @@ def test_a_missing_permission_for_priority_is_reported_once(
 ) -> None:
     nodes = list(DEMO.nodes.values())
     allow(monkeypatch, capable=True, limit=0)
-    assert describe_nice_problem(nodes) is None
+    assert describe_priority_problem(nodes) is None
     allow(monkeypatch, capable=False, limit=0)
-    problem = describe_nice_problem(nodes)
+    problem = describe_priority_problem(nodes)
     assert problem is not None
     assert "arm_left_bridge" in problem
     assert "renderer" not in problem
     assert "\n" not in problem
+
+
+def test_a_missing_permission_for_real_time_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    allow(monkeypatch, capable=True, limit=0)
+    monkeypatch.setattr(priority, "_may_set_real_time", lambda wanted: False)
+    problem = describe_priority_problem(list(DEMO.nodes.values()))
+    assert problem is not None
+    assert "arm_left_bridge" in problem
+    assert "renderer" not in problem
+
+
+def test_real_time_needs_permission_and_a_launcher_without_positive_niceness(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    allow(monkeypatch, capable=True, limit=0)
+    assert find_real_time_priority(10) == 10
+    assert find_real_time_priority(None) is None
+    monkeypatch.setattr(os, "getpriority", lambda which, who: 5)
+    assert find_real_time_priority(10) is None
+    allow(monkeypatch, capable=True, limit=0)
+    monkeypatch.setattr(priority, "_may_set_real_time", lambda wanted: False)
+    assert find_real_time_priority(10) is None
+
+
+def test_a_user_without_permission_may_not_set_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert not priority._may_set_real_time(1)
 
 
 @pytest.mark.parametrize(("user", "remedy"), [(0, "CAP_SYS_NICE"), (1000, "start as root")])
@@ -67,7 +106,7 @@ def test_root_is_not_advised_to_become_root(
 ) -> None:
     allow(monkeypatch, capable=False, limit=0)
     monkeypatch.setattr(os, "geteuid", lambda: user)
-    problem = describe_nice_problem(list(DEMO.nodes.values()))
+    problem = describe_priority_problem(list(DEMO.nodes.values()))
     assert problem is not None
     assert [one for one in ("CAP_SYS_NICE", "start as root") if one in problem] == [remedy]
 
@@ -93,6 +132,7 @@ def test_what_the_arms_wait_for_goes_before_all_else_in_the_demo() -> None:
         "twin_finger", "camera", "triangulator", "planner", "twin_arms", "arm_left_bridge",
         "arm_right_bridge",
     }  # fmt: skip
+    assert {name for name, node in DEMO.nodes.items() if node.realtime_priority} == chain
     first = max(DEMO.nodes[name].nice for name in chain)
     assert first < 0 <= min(node.nice for node in DEMO.nodes.values() if node.name not in chain)
 

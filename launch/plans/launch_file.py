@@ -103,6 +103,14 @@ class NodeSpec(StrictModel):
         description="niceness of the process, added to that of the launcher; values below 0 "
         "(higher priority) need root or CAP_SYS_NICE",
     )
+    realtime_priority: int | None = Field(
+        default=None,
+        ge=1,
+        le=49,
+        description="real-time priority of the process when its nodes are ready: it then "
+        "interrupts all processes with a lower or no real-time priority; needs root, CAP_SYS_NICE "
+        "or rtprio in limits.conf; null: none",
+    )
 
 
 class ClocksSpec(StrictModel):

@@ -258,6 +258,7 @@ def _make_node(
         start_deadline_s=entry.spec.start_deadline_s,
         liveness_s=entry.spec.liveness_s,
         nice=entry.spec.nice,
+        realtime_priority=entry.spec.realtime_priority,
         process=entry.spec.process or entry.name,
     )
 

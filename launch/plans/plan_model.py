@@ -151,6 +151,9 @@ class ResolvedNode(StrictModel):
         default=None, description="maximum time without a heartbeat, s"
     )
     nice: int = Field(default=0, description="niceness of the process; 0 in older bags")
+    realtime_priority: int | None = Field(
+        default=None, description="real-time priority of the process; null: none"
+    )
     process: str = Field(default="", description="process name; empty if it is the node's name")
 
     @property

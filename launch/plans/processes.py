@@ -10,7 +10,7 @@ from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import find_role
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
-COMMON_KEYS = ("host", "nice", "restart", "liveness_s")
+COMMON_KEYS = ("host", "nice", "realtime_priority", "restart", "liveness_s")
 """The keys of a node that must be equal for all nodes in one process."""
 
 

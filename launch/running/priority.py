@@ -1,10 +1,11 @@
-"""Determine the minimum niceness (highest priority) that the user is permitted to set."""
+"""Determine which process priorities the user is permitted to set."""
 
 from __future__ import annotations
 
 import os
 import resource
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from flexsheet.launch.plans.plan_model import ResolvedNode
@@ -38,14 +39,37 @@ def min_node_nice() -> int:
     return min(min_nice_step(), os.getpriority(os.PRIO_PROCESS, 0))
 
 
+def find_real_time_priority(configured: int | None) -> int | None:
+    """Return the configured real-time priority, or None if the user may not set it.
+
+    Return None also if this process has a positive niceness, because nodes then must not delay
+    other programs.
+    """
+    if configured is None or os.getpriority(os.PRIO_PROCESS, 0) > 0:
+        return None
+    return configured if _may_set_real_time(configured) else None
+
+
+def _may_set_real_time(priority: int) -> bool:
+    """Try to set a real-time priority on a temporary thread.
+
+    The result depends on capabilities, limits and control groups together.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        attempt = pool.submit(os.sched_setscheduler, 0, os.SCHED_RR, os.sched_param(priority))
+        return not isinstance(attempt.exception(), PermissionError)
+
+
 def list_denied(nodes: Sequence[ResolvedNode]) -> list[str]:
-    """Return the names of the nodes whose niceness is not permitted."""
+    """Return the names of the nodes whose niceness or real-time priority is not permitted."""
     minimum = min_node_nice()
-    return [node.name for node in nodes if node.nice < minimum]
+    priorities = {node.realtime_priority for node in nodes}
+    denied = {one for one in priorities if one and not _may_set_real_time(one)}
+    return [node.name for node in nodes if node.nice < minimum or node.realtime_priority in denied]
 
 
-def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Return a text about the nodes whose niceness is not permitted.
+def describe_priority_problem(nodes: Sequence[ResolvedNode]) -> str | None:
+    """Return a text about the nodes whose niceness or real-time priority is not permitted.
 
     Returns None if there are no such nodes.
     """
@@ -56,9 +80,9 @@ def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
     remedy = (
         "give the container the capability CAP_SYS_NICE"
         if os.geteuid() == 0
-        else "start as root or set `nice` in /etc/security/limits.conf"
+        else "start as root or set `nice` and `rtprio` in /etc/security/limits.conf"
     )
     return (
-        f"{', '.join(names)}: this user may not set nice below {min_node_nice()}, so these nodes "
-        f"do not get their priority; {remedy}"
+        f"{', '.join(names)}: this user may not set the `nice` or `realtime_priority` of these "
+        f"nodes, so they answer later on a busy computer; {remedy}"
     )

@@ -45,7 +45,11 @@ from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.launch.running.fork_server import NODE_ARGUMENTS, ForkServer
 from flexsheet.launch.running.host import HostAgent, make_output
 from flexsheet.launch.running.keys import KeyWatch, make_rings
-from flexsheet.launch.running.priority import describe_nice_problem, min_nice_step
+from flexsheet.launch.running.priority import (
+    describe_priority_problem,
+    find_real_time_priority,
+    min_nice_step,
+)
 from flexsheet.launch.running.runs import (
     HOST_FILE,
     RUN_VARIABLE,
@@ -561,7 +565,7 @@ class RunningGraph:
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
         for omitted in self.plan.omitted:
             self._report(LAUNCHER, f"{omitted.name} is not started: {REASON_TEXTS[omitted.reason]}")
-        if problem := describe_nice_problem(self.nodes):
+        if problem := describe_priority_problem(self.nodes):
             self._report(LAUNCHER, problem)
         for name, process in self._processes.items():
             self._supervisors[name] = asyncio.create_task(self._supervise(process), name=name)
@@ -772,6 +776,7 @@ class RunningGraph:
         config = ProcessConfig(
             name=process.name,
             nodes=tuple(node_config(self.plan, node, self.run) for node in process.nodes),
+            realtime_priority=find_real_time_priority(process.settings.realtime_priority),
         )
         server = self._fork_server
         if server is not None and not await server.is_ready():

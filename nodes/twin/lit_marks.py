@@ -15,6 +15,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.messages.types import Frame, TwinArms
 from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.background import leave_real_time
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.twin.eye import TrueProjector
 from flexsheet.nodes.twin.membrane import NotConvergedError, make_edge_plane
@@ -64,7 +65,7 @@ class LitMarks:
         self._scene, self._apparatus = scene, apparatus
         self._world_from_projector = pose_matrix(require_projector(scene).world_from_projector)
         self._frames: deque[tuple[int, Floats]] = deque(maxlen=16)
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="sheet")
+        self._worker = ThreadPoolExecutor(1, "sheet", leave_real_time)
         self._solving: Future[_Heights | None] | None = None
         self._solved_ns = 0
         self._heights: _Heights | None = None
