@@ -235,8 +235,7 @@ class BaseFit:
 
 @dataclass(frozen=True, slots=True)
 class _Unknowns:
-    """The current estimates of the unknown transforms world_from_base and flange_from_board (4, 4).
-    """
+    """The current estimates (4, 4) of the transforms world_from_base and flange_from_board."""
 
     world_from_base: Floats
     flange_from_board: Floats
