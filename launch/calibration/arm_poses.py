@@ -65,12 +65,10 @@ BOARD_COLUMNS = (
 )
 
 MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
-"""An arm is at rest if its joints move at most by this angle (rad) for at least this duration (s).
-"""
+"""An arm is at rest if its joints move by at most this angle (rad) for this duration (s)."""
 
 MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
-"""The minimum rotation (rad) and translation (m) between a new pose of the board and a recorded
-one.
+"""The minimum rotation (rad) and translation (m) between a new and a recorded pose of the board.
 
 A pose is new if it differs from each recorded pose by at least one of these two minimums.
 """

@@ -51,9 +51,7 @@ image's diagonal.
 
 
 class BinGroup(StrEnum):
-    """The kinds of conditions for image pairs, in the order in which the user is asked to meet
-    them.
-    """
+    """The kinds of conditions, in the order in which the user is asked to meet the conditions."""
 
     TILT = "tilt"
     DISTANCE = "distance"

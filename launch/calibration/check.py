@@ -105,8 +105,7 @@ def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
 
 
 def compute_rigid_residuals(points: Floats, model: Floats) -> Floats:
-    """Return the distances (n,) between n measured and n model points after the best rigid
-    alignment.
+    """Return the distances (n,) between n measured points and n model points after rigid alignment.
 
     points, model: measured points and model points (n, 3).
 

@@ -79,8 +79,8 @@ SIMULATED_STEP_S: Mapping[StepName, float] = {
 }
 """The median durations (s) of the steps in 30 simulated laboratories on two processor cores.
 
-Source: docs/results/robustness-commissioned-modern.json. That source has no duration for the
-    verification in a running graph.
+Source: docs/results/robustness-commissioned-modern.json. That file has no duration for the
+verification in a running graph.
 """
 
 
@@ -114,8 +114,8 @@ class StepResult(LimitedModel):
     advice: text that states what to do if the residual exceeds `limit`.
     uncertainty: standard deviations by name. Each name ends in the unit.
     scene_values: new values for the scene, by dotted path in the scene file.
-    parameters: names of calibration files in the folder. The key TYPE.PARAMETER of a file contains
-        the node type and the parameter that use the file.
+    parameters: names of calibration files in the folder. Each key TYPE.PARAMETER names a node type
+        and its parameter, which is set to the file name.
     node_values: measured values of other node parameters.
     missing: quantities that were not measured.
     figures: further results.
@@ -161,8 +161,7 @@ class State(LimitedModel):
 
 
 class MissingDataError(CommissionError):
-    """Raised if a step of a commissioning needs data from real devices, but the data were not
-    given.
+    """Raised if a step of a commissioning needs data from real devices that were not given.
 
     The error text states how to capture the data.
     """
@@ -176,7 +175,7 @@ class MissingDataError(CommissionError):
 
 
 class VerificationError(CommissionError):
-    """Raised if a running graph cannot complete the stroke of the finger for the verification."""
+    """Raised if a running graph fails during the finger stroke that verifies the calibration."""
 
     code = "commission-verification"
     remedy = "Close other graphs, and run the same command again; finished steps are kept."
@@ -191,7 +190,7 @@ class Commissioning:
 
     If the folder contains a state, the sequence continues from this state.
 
-    launch_file, scene_file: files whose values are used until they are measured.
+    launch_file, scene_file: launch file and scene from before the commissioning.
     apparatus: true parameters of a simulated laboratory, as given by --apparatus; None for real
         devices.
 

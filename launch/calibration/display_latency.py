@@ -41,7 +41,7 @@ For the errors of the measured times, the estimation considers the standard devi
 """
 
 MIN_CONTRAST = 3.0
-"""The minimum difference in grey level between camera images of white light and of black."""
+"""The minimum difference in grey level between camera images of a white and a black projection."""
 
 SIMULATED_SWITCHES, LEVELS = 60, 16
 """The number of simulated switches, and the number of brightness steps between black and white.
@@ -99,8 +99,8 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
     late = ages_s > MAX_LATENCY_S
     if late.sum() < MIN_SWITCHES or is_new[late].mean() < 0.5:
         raise DisplayLatencyError(
-            f"only {int(is_new[late].sum())} of {int(late.sum())} images later than "
-            f"{1e3 * MAX_LATENCY_S:.0f} ms after a switch show the new state"
+            f"only {int(is_new[late].sum())} of {int(late.sum())} images that were taken more than "
+            f"{1e3 * MAX_LATENCY_S:.0f} ms after a switch show the new state; record more switches"
         )
     latencies_s = np.arange(0.0, MAX_LATENCY_S, STEP_S)
     logs = []

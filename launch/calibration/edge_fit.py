@@ -45,7 +45,7 @@ compliance of the flange.
 """
 
 PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
-"""The standard deviations (19,) of the unknowns before the fit, in rad, m and m/N."""
+"""The standard deviations (19,) of the prior distributions of the unknowns, in rad, m and m/N."""
 
 PRIOR_COMPLIANCE_M_PER_N = 7.5e-5
 MAX_COMPLIANCE_M_PER_N = 1e-2

@@ -46,7 +46,9 @@ position in the world and the joint angles of both arms.
 MAX_PROBLEMS = 20
 
 ALONG = (-0.45, 0.0, 0.45)
-"""The positions of the simulated marks relative to the edge's centre, as fractions of its length.
+"""The positions of the simulated marks along the clamped edge, as fractions of the edge's length.
+
+The edge's centre has the position 0.
 """
 
 SIMULATED_POSES = 24
@@ -54,7 +56,7 @@ MAX_TRIES = 400
 TILT_RAD = np.array([0.5, 0.35, 0.1])
 CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
 MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
-"""The minimum stretch ratio of the simulated sheet, and the fraction of its range that is used.
+"""The minimum stretch ratio of the simulated sheet, and the used fraction of a range.
 
 The range extends from this minimum to the maximum stretch ratio in the scene.
 """

@@ -53,7 +53,10 @@ def make_patterns(width_px: int, height_px: int) -> list[Image]:
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:
-        raise DecodeError(f"OpenCV cannot generate a Gray code of {width_px}x{height_px} pixels")
+        raise DecodeError(
+            f"OpenCV cannot generate a Gray code of {width_px}x{height_px} pixels; correct the "
+            "size of the projector's image"
+        )
     white = np.full((height_px, width_px), 255, np.uint8)
     return [*(np.asarray(image, np.uint8) for image in images), white, np.zeros_like(white)]
 
@@ -85,7 +88,7 @@ def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> D
     expected = 2 * sum(bits) + 2
     if len(images) != expected:
         raise DecodeError(
-            f"there are {len(images)} images of {expected} patterns; give one image per pattern"
+            f"there are {len(images)} images, but {expected} patterns; give one image per pattern"
         )
     if len({image.shape for image in images}) != 1:
         raise DecodeError(

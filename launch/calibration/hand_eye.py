@@ -82,8 +82,7 @@ effect only if all poses agree up to rounding errors.
 MAX_READMISSIONS = 5
 
 MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
-"""The maximum plausible standard deviations of errors of the flange's position (m) and rotation
-(rad).
+"""The maximum plausible standard deviations of the flange's position (m) and rotation (rad).
 
 Larger values indicate that joint angles are assigned to the wrong joints.
 """
@@ -95,9 +94,7 @@ A larger fraction indicates another mistake, such as a wrong board.
 """
 
 MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
-"""The minimum estimated standard deviations of errors of the flange's rotation (rad) and position
-(m).
-"""
+"""The minimum estimated standard deviations of the flange's rotation (rad) and position (m)."""
 
 MAX_ARM_RAD, MAX_ARM_M = 0.1, 0.1
 
@@ -109,8 +106,7 @@ ADVICE = (
 INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
 """The three corners of the initial simplex of the optimization, relative to the initial values.
 
-The variables are the logarithms of the standard deviations of two errors: the flange's rotation and
-    position.
+The variables are the logarithms of the standard deviations of the flange's rotation and position.
 """
 
 MAX_ITERATIONS = 30
@@ -141,9 +137,10 @@ class CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class LensRig:
-    """The lenses of the stereo camera.
+    """The lenses and poses of the stereo camera.
 
-    right_from_left, world_from_left: transforms (4, 4) between the cameras and to the world.
+    right_from_left: transform (4, 4) from the left to the right camera's frame.
+    world_from_left: transform (4, 4) from the left camera's frame to the world.
     """
 
     left: CameraLens
@@ -204,8 +201,8 @@ class BaseFit:
         squared.
     corner_sigma_px: standard deviation of the error of one pixel coordinate of a corner.
     arm_sigma_rad, arm_sigma_m: standard deviations of one component of the flange's pose error.
-    jackknife_ratio: ratio of two standard deviations, from the jackknife and from the fit. It is an
-        rms over the six components of the motion.
+    jackknife_ratio: ratio of the jackknife's standard deviation to the standard deviation of the
+        fit. It is an rms over the six components of the motion.
     leave_one_out: changes (n, 6) of the base pose if each of the n poses in turn is excluded from
         the fit.
     """
@@ -550,9 +547,7 @@ def _find_rough_inliers(discrepancies: Floats) -> Bools:
 
 @dataclass(frozen=True, slots=True)
 class _NoiseModel:
-    """The standard deviations of the errors of corner coordinates (px) and flange poses (rad and
-    m).
-    """
+    """The standard deviations of errors of corner coordinates (px) and flange poses (rad and m)."""
 
     corner_px: float
     arm_rad: float
@@ -654,9 +649,7 @@ def _linearize(
 def _normal_equations(
     poses: Sequence[_LinearizedPose], model: _NoiseModel
 ) -> tuple[Floats, Floats]:
-    """Return the matrix (12, 12) and the vector (12,) of the normal equations for a Gauss-Newton
-    step.
-    """
+    """Return the matrix (12, 12) and vector (12,) of the equations for a Gauss-Newton step."""
     weights = model.compute_weights(poses)
     slopes = np.array([one.by_unknowns for one in poses])
     measured = np.array([one.measured for one in poses])
@@ -684,8 +677,7 @@ def _estimate_deviations(
     def neg_log_likelihood(logs: Floats) -> float:
         """Return -2 times the logarithm of the restricted likelihood, up to a constant.
 
-        logs: logarithms (2,) of the standard deviations of the flange's rotation and position
-            errors.
+        logs: logarithms (2,) of the standard deviations of the flange's rotation and position.
         """
         logs = np.clip(
             logs,

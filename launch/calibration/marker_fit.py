@@ -38,16 +38,13 @@ the true error in simulated laboratories with seeds 0 to 11.
 """
 
 PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])
-"""The uncertainty (3,) of the three expected standard deviations, as standard deviations of
-logarithms.
+"""The prior uncertainties (3,) of three standard deviations, on a logarithmic scale.
 
-The three values apply to the errors of touches, orientations and points.
+The three standard deviations are of the errors of touches, orientations and points.
 """
 
 POINT_GRID_M = 1e-6
-"""Touched points are the same if their positions, rounded to multiples of this value (m), are
-equal.
-"""
+"""Touched points are the same if their positions are equal after rounding to this grid (m)."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)
@@ -161,7 +158,8 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     def solve(logarithms: Floats) -> tuple[float, Floats, Floats, Floats]:
         """Return the cost, the offset (3,), its covariance (3, 3), and the weighted residuals.
 
-        logarithms: logarithms (3,) of the ratios of the standard deviations to the expected values.
+        logarithms: logarithm (3,) of each of three standard deviations divided by its expected
+            value.
         """
         noise, turned, placed = (expected_m * np.exp(logarithms)) ** 2
         covariance = fixed + turned * same_orientation + placed * same_point

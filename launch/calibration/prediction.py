@@ -56,8 +56,7 @@ NORMAL_95 = 1.645
 """The 95 % quantile of the standard normal distribution."""
 
 RADIUS_STD_M = 3e-4
-"""The standard deviation (m) of the radius of a soft fingertip that was measured with a calliper.
-"""
+"""The standard deviation (m) of a soft fingertip's radius that was measured with a calliper."""
 
 EYE_STD_M = 5e-3
 """The standard deviation (m) per axis of an eye position from a head tracker.
@@ -140,10 +139,10 @@ class Knowledge:
 
 
 def predict_errors(known: Knowledge, tracking_m: float) -> dict[Metric, PredictedError]:
-    """Predict the errors of sheet and fingertip during a stroke, and the errors of image and force
-    at rest.
+    """Predict the errors of a calibrated laboratory.
 
-    The finger moves at the working speed of the scene.
+    The errors of sheet and fingertip apply to a stroke of the finger at the working speed of the
+    scene. The errors of image and force apply to a finger at rest.
 
     tracking_m: mean tracking error of the sheet that the devices report during a stroke. It is
         independent of the calibration errors. Therefore, the squares of both errors are added.

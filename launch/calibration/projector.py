@@ -1,8 +1,8 @@
 """Calibrate the optics and the pose of the projector from points that its pixels light.
 
-A projector is an inverse camera: each of its pixels lights a point. The points are on the sheet,
-    and the two cameras of the stereo camera measure their positions. Therefore, the poses of the
-    sheet need not be known.
+A projector is an inverse camera, because each of its pixels lights a point. The points are on the
+sheet, and the two cameras of the stereo camera measure their positions. Therefore, the poses of the
+sheet need not be known.
 """
 
 from __future__ import annotations
@@ -235,8 +235,9 @@ def _rms(values: Floats) -> float:
 
 
 def _measure_depth_range(points: ProjectorPoints, guess: Projector) -> float:
-    """Return the depth range (m), along the projector's axis, that contains the central 90 % of the
-    points.
+    """Return the depth range (m) of the central 90 % of the points.
+
+    The depth is measured along the projector's axis.
     """
     pose = guess.world_from_projector
     along = apply(inverse(pose_matrix(pose)), points.world)[:, 2]
@@ -279,8 +280,7 @@ def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) ->
         return np.asarray((projected.reshape(-1, 2) - pixels).ravel())
 
     def derivatives(x: Floats) -> Floats:
-        """Return the derivatives (2n, 13) of the residuals of n points with respect to the 13
-        unknowns.
+        """Return the derivatives (2n, 13) of the residuals of n points with respect to 13 unknowns.
 
         The unknowns are rotation (3), translation (3), focal length, principal point (2), and the
         distortion coefficients k1, k2, p1 and p2.

@@ -30,10 +30,7 @@ if TYPE_CHECKING:
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""The length of an arrow that shows a residual of the size of the 95 % quantile.
-
-The length is in pixels of the camera image.
-"""
+"""The length (px of the camera image) of an arrow for a residual at the 95 % quantile."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }

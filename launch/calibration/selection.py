@@ -44,8 +44,7 @@ MAX_OUTLIER_FRACTION = 0.15
 """An image pair is not used if a larger fraction of its corners are outliers."""
 
 REPEAT_PX = 1.0
-"""Two image pairs show the same board pose if the median displacement (px) of corners is smaller.
-"""
+"""Two image pairs show the same board pose if the corners' median displacement (px) is smaller."""
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:

@@ -19,24 +19,22 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""The duration (s) before and after a force measurement, and the maximum depth change (m) in it.
+"""The time (s) before and after a force measurement, and the maximum depth change (m) in this time.
 
 Force gauges lag, so forces that were measured during a motion are not used.
 """
 
 MAX_GAP_S = 0.05
-"""The maximum time (s) between a measured force and the nearest messages about fingertip and arms.
-"""
+"""The maximum time (s) between a measured force and the nearest fingertip and arm messages."""
 
 MIN_DEPTH_M = 0.003
 """The minimum depth (m) of a push.
 
-At smaller depths, the error of the fingertip's position has a larger effect than the force model.
+At smaller depths, errors of the fingertip's position change the expected force too much.
 """
 
 REVERSAL_M = 0.001
-"""Loading changes to unloading, and vice versa, if the depth reverses by more than this value (m).
-"""
+"""The push changes between loading and unloading if the depth reverses by more than this (m)."""
 
 MAX_ROWS = 300
 
@@ -155,8 +153,7 @@ def _gap_s(motion: SampledMotion, at_ns: int) -> float:
 
 
 def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[float, float], float]:
-    """Return the depth and position (x, y) of a fingertip, and the distance between the edges, in
-    m.
+    """Return the depth and position (x, y) of a fingertip, and the distance of the edges, in m.
 
     The depth is the distance of the fingertip behind the flat sheet between the edges. The position
     is relative to the sheet's centre.

@@ -174,7 +174,7 @@ NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ra
 
 
 PRIOR_WIDTH_M, PRIOR_LOG_CUBIC = 0.0005, 0.2
-"""The standard deviations of two parameters before the fit.
+"""The standard deviations of the prior distributions of two fitted parameters.
 
 The first parameter is the unstretched width (m), which is measured with a ruler. The second is the
 logarithm of the cubic ratio, which is 1 for ideal rubber.
@@ -371,14 +371,15 @@ def tabulate_pushes(
     if not cells or missing:
         where = f" at stretch, x, y {missing[0]}" if missing else ""
         raise SheetModelFitError(
-            f"there are no usable rows{where}; a table requires all combinations of stretch and "
+            f"there are no usable rows{where}; measure pushes at all combinations of stretch and "
             "position"
         )
     shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
     deepest = min(max(depth for depth, _ in rows) for rows in cells.values())
     if not shallowest < deepest:
         raise SheetModelFitError(
-            "the stretches and positions have no common depth range, which a table requires"
+            "the stretches and positions have no common depth range; measure pushes at the same "
+            "depths for all stretches and positions"
         )
     count = min(len({depth for depth, _ in rows}) for rows in cells.values())
     depths = np.geomspace(shallowest, deepest, max(2, min(count, 12)))

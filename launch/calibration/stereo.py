@@ -49,7 +49,9 @@ from flexsheet.messages.scene import Lens
 from flexsheet.nodes.arrays import Floats
 
 MAX_DEPTH_ERROR_FRACTION = 0.05
-"""The maximum standard deviation of depth in a valid calibration, relative to the working distance.
+"""The maximum standard deviation of depth in a valid calibration.
+
+The value is a fraction of the working distance.
 """
 
 
@@ -150,8 +152,7 @@ def compute_uncertainty(
     distance_m: float | None,
     progress: Progress = ignore_progress,
 ) -> Uncertainty:
-    """Compute the covariance of a rig's parameters, and the resulting uncertainty of a measured
-    fingertip.
+    """Compute the covariance of a rig's parameters, and the uncertainty of a measured fingertip.
 
     If the results of jackknife refits scatter more than the covariance of the fit predicts, the
     covariance is increased accordingly.
@@ -182,8 +183,9 @@ def compute_uncertainty(
 
 
 def make_lens(numbers: Floats) -> Lens:
-    """Make a lens from the parameters fx, fy, cx, cy (px) and the distortion coefficients k1, k2,
-    p1, p2.
+    """Make a lens from eight numbers.
+
+    numbers: parameters fx, fy, cx, cy (px) and distortion coefficients k1, k2, p1, p2.
     """
     fx, fy, cx, cy, k1, k2, p1, p2 = (float(number) for number in numbers)
     return Lens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=(k1, k2, p1, p2, 0.0))

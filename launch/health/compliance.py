@@ -108,8 +108,8 @@ class LoopRisk(StrEnum):
     """The risk that the control loop of sheet and hand is unstable or renders a wrong force.
 
     OSCILLATION: a hand of low damping can oscillate, because the sheet follows the finger too late.
-    DELAY: because of the delay, the sheet cannot render the object's force within the stability
-        limits.
+    DELAY: the sheet cannot render the object's force within the stability limits that result from
+        the delay.
     SHEET: the sheet cannot render the object's force, even if there is no delay.
     """
 

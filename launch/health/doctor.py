@@ -31,8 +31,7 @@ PROBE_S = 1.0
 """The duration (s) of the measurement of the processor load."""
 
 PROBE_PERIOD_S, PROBE_RUN_S = 1.0 / 140.0, 0.001
-"""The cycle period (s) of a node that controls an arm, and the node's processor time (s) per cycle.
-"""
+"""The cycle period (s) of an arm control node, and the node's processor time (s) per cycle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +203,7 @@ def check_sockets() -> Finding:
         return Finding(
             "sockets",
             "failed",
-            f"{directory} belongs to another user",
+            f"{directory} belongs to another user or is not writable",
             "set FLEXSHEET_RUNS to another folder",
         )
     count = len(list_live_runs())

@@ -147,8 +147,7 @@ class Layout:
         return bool(self.reached.all()) and not self.blocked_paths
 
     def speed_m_per_s(self, fraction: float) -> float:
-        """Return the finger speed (m/s) that both arms can follow at a given fraction of the
-        samples.
+        """Return the finger speed (m/s) that both arms can follow at a given fraction of samples.
 
         Only reachable samples are considered. Return 0 if no sample is reachable.
 
@@ -160,8 +159,7 @@ class Layout:
         return float(np.quantile(speeds[self.reached], 1.0 - fraction))
 
     def speeds_m_per_s(self, reach: ArmReach) -> Floats:
-        """Return the maximum finger speed (n,), in m/s, that an arm can follow at each of n
-        samples.
+        """Return the maximum finger speed (n,) (m/s) that an arm can follow at each of n samples.
 
         The speeds of the arm and the sheet are assumed to be proportional to the speed of the
         finger. At samples that the arm cannot reach, the result is NaN.
@@ -401,8 +399,7 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
 
 
 def _find_largest(scene: Scene, key: str, step: float, progress: Progress) -> float | None:
-    """Return the largest value of one limit of the working range for which both arms reach all
-    samples.
+    """Return the largest limit of the working range with which both arms reach all samples.
 
     The search is a bisection over the multiples of `step` below the value in the scene. Return None
     if the arms reach all samples with no tested value.
@@ -453,8 +450,7 @@ def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
 
 
 def _find_base_offset(layout: Layout, side: Side, progress: Progress) -> Floats | None:
-    """Return the smallest displacement (3,), in m, of an arm's base that makes all samples
-    reachable.
+    """Return the smallest displacement (3,), in m, of an arm's base to reach all samples.
 
     Return None if no tested displacement is sufficient.
     """
@@ -655,8 +651,7 @@ class _TiltDepthGrid:
         return np.where(np.isfinite(cells), cells, np.nan)
 
     def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Return the colour of each grid cell as an array (DEPTHS, TILTS, 3) of red, green and
-        blue.
+        """Return the red, green and blue values of each grid cell, as an array (DEPTHS, TILTS, 3).
 
         The colour represents the limit that is violated most often in the cell. The colour is paler
         if fewer samples violate a limit.

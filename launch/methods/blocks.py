@@ -49,11 +49,10 @@ def bootstrap_median(values: Floats) -> Interval | None:
 
 
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
-    """Return the median ratio of a configuration's values to the control's values in the same
-    blocks.
+    """Return the median ratio of a configuration's values to the control's values.
 
-    The result contains the confidence interval of the median. The median is computed from
-    logarithms, so a ratio and its inverse have the same weight.
+    Values of the same block are compared. The result contains the confidence interval of the
+    median. The median is computed from logarithms, so a ratio and its inverse have the same weight.
 
     values, control: positive values (n,), one for each of n blocks.
     """

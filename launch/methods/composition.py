@@ -227,10 +227,9 @@ class Composition:
 
     @property
     def unmet(self) -> str:
-        """Return sentences about the metrics that exceed a tolerance, and the methods that are out
-        of range.
+        """Return sentences about metrics that exceed a tolerance, and about methods out of range.
 
-        The text is empty if there are no such metrics and methods.
+        The text is empty if there are no such metrics or methods.
         """
         exceeded = ", ".join(metric.label for metric in self.last.exceeded)
         stages = ", ".join(stage for stage, option in self.chosen.items() if not option.in_range)
@@ -252,8 +251,9 @@ class Composition:
         }
 
     def explain(self) -> list[str]:
-        """Return sentences about the result, each tolerance that is not met, and each method out of
-        range.
+        """Return sentences about the result and its problems.
+
+        A problem is a tolerance that is not met or a method that is out of range.
         """
         run = self.last
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
@@ -401,8 +401,7 @@ def _find_cheaper(
 
 
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
-    """Return the cheapest combination whose predicted metrics are within the attainable limits
-    (`_relax`).
+    """Return the cheapest combination that is predicted to be within the attainable limits.
 
     If no combination is within all limits, return the combination with the smallest excess.
 

@@ -116,9 +116,7 @@ class Configuration:
             precompute_soft_body(scene, body.skin_spacing_m, None, None, progress)
 
     def describe(self) -> dict[str, Any]:
-        """Return the methods and the planner's parameters, as a trial's description stores them.
-
-        """
+        """Return the methods and the planner's parameters for the description of a trial."""
         return {"methods": self.methods.model_dump(mode="json"), "planner": dict(self.planner)}
 
 

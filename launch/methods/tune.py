@@ -145,8 +145,7 @@ TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""The name of the two-pass image correction in the chart, by the chosen method of the sheet shape.
-"""
+"""The name of the two-pass image correction in the chart, by the method of the sheet shape."""
 
 
 def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
@@ -167,7 +166,7 @@ def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
         if names and not one.is_used(scene):
             raise UnknownTunableError(
                 f'scene "{scene.name}" does not use the method family "{one.name}": it has no '
-                f"`{one.required_key}`"
+                f"`{one.required_key}`; omit this family, or add that part to the scene"
             )
     return [one for one in chosen if one.is_used(scene)]
 
