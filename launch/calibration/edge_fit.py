@@ -4,10 +4,10 @@ A mark with the position m in the frame of the clamped edge is measured at the w
 
 world_from_base exp(b) forward(q + d) flange_from_edge exp(e) m + c f
 
-where forward is the forward kinematics of the arm, q are the reported joint angles, and f is the
-force of the stretched sheet on the edge. The unknowns are the pose error b of the base, the pose
-error e of the edge, the joint offsets d, and the compliance c of the flange. A pose error consists
-of a rotation vector and a translation, and exp converts it to a matrix.
+where forward is the arm's forward kinematics, q are the reported joint angles, and f is the force
+of the stretched sheet on the edge. The unknowns are the pose errors b of the base and e of the
+edge, the joint offsets d, and the compliance c of the flange. A pose error consists of a rotation
+vector and a translation, and exp converts it to a matrix.
 
 The marks determine the total effect of the unknowns, but not each unknown. This is sufficient for
 positions in the measured working range. To make the solution unique, each unknown has a normal

@@ -159,7 +159,7 @@ class Layout:
         return float(np.quantile(speeds[self.reached], 1.0 - fraction))
 
     def speeds_m_per_s(self, reach: ArmReach) -> Floats:
-        """Return the maximum finger speed (n,) (m/s) that an arm can follow at each of n samples.
+        """Return the maximum finger speeds (n,), in m/s, that an arm can follow at n samples.
 
         The speeds of the arm and the sheet are assumed to be proportional to the speed of the
         finger. At samples that the arm cannot reach, the result is NaN.
@@ -176,9 +176,9 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
 
     The contact points are sampled from all directions within the scene's tilt range. In the first
     pose at each contact point, the object touches the centre of the sheet. In the other poses, the
-    sheet has rolled there from another contact, so the object touches another point of the sheet.
-    For each axis of the sheet, the two rolls are used that end farthest from the sheet's centre.
-    Contacts outside the sheet's usable size are moved to its limit.
+    sheet has rolled to this contact point from another contact, so the object touches another point
+    of the sheet. For each axis of the sheet, the two rolls are used that end farthest from the
+    sheet's centre. Contacts outside the sheet's usable area are moved to the border of this area.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)
@@ -402,7 +402,7 @@ def _find_largest(scene: Scene, key: str, step: float, progress: Progress) -> fl
     """Return the largest limit of the working range with which both arms reach all samples.
 
     The search is a bisection over the multiples of `step` below the value in the scene. Return None
-    if the arms reach all samples with no tested value.
+    if all tested values are too large.
 
     key: name of the limit in the scene, such as `tilt_rad`.
     """
@@ -450,7 +450,7 @@ def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
 
 
 def _find_base_offset(layout: Layout, side: Side, progress: Progress) -> Floats | None:
-    """Return the smallest displacement (3,), in m, of an arm's base to reach all samples.
+    """Return the smallest base displacement (3,), in m, with which the arm reaches all samples.
 
     Return None if no tested displacement is sufficient.
     """

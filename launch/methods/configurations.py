@@ -121,7 +121,7 @@ class Configuration:
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return the cheapest method of each family that covers the scene's working range.
+    """Return the cheapest method of each family whose range contains the scene's working range.
 
     Errors are not considered. If no method of a method family has a sufficient range, the method
     with the largest range is returned.
@@ -162,7 +162,7 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""The name of the configuration with which others are compared.
+"""The name of the configuration with which other configurations are compared.
 
 This configuration runs twice in each block of measurements.
 """

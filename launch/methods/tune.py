@@ -2,7 +2,7 @@
 
 A method family contains interchangeable methods for one task. The methods are measured on this
 computer over the scene's working range. A method is sufficient if its stated range contains the
-working range, and if its maximum error is at most the scene's tolerance minus a margin. If no
+working range. Its maximum error must also be at most the scene's tolerance minus a margin. If no
 method is sufficient, the best insufficient method is chosen and reported.
 """
 
@@ -138,7 +138,8 @@ TUNABLES = (
 )
 """The tunable method families in the order of tuning.
 
-The sheet shape precedes the image correction, because the settings of the correction depend on it.
+The sheet shape precedes the image correction, because the settings of the correction depend on the
+sheet shape.
 """
 
 TWO_PASS_NAMES = {

@@ -224,7 +224,7 @@ def tune_system(
 
     runs: number of runs per combination. The largest 95 % value of these runs is used.
 
-    Raises ExperimentError if all runs of a combination fail.
+    Raises ExperimentError if a run of a combination fails.
     """
     scene = load_scene(scene_file)
     progress("measuring the tracking with the noise of each marker method")
