@@ -170,7 +170,7 @@ def test_points_that_make_no_calibration_are_rejected(
 
 def test_images_that_are_not_of_the_patterns_are_rejected(scene: Scene) -> None:
     dark = [np.full((60, 80), 10, np.uint8)] * 38
-    with pytest.raises(DecodeError, match="there are 5 images of 38 patterns"):
+    with pytest.raises(DecodeError, match="there are 5 images, but 38 patterns"):
         decode_patterns(dark[:5], 400, 300)
     with pytest.raises(
         ProjectorError, match="pose 1, left camera: the projector lights only 0 camera pixels"

@@ -1,11 +1,11 @@
 """Read, record and simulate poses of an arm with a calibration board on its flange.
 
-The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row of the table is
-a pose of the arm at rest. It contains six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) and
-the names of two image files (`left`, `right`). Instead of images, a row can contain the pose of the
-board in the left camera's frame. The columns are then `board_x_m`, `board_y_m`, `board_z_m`
-(position of the first corner), and `board_rx_rad`, `board_ry_rad`, `board_rz_rad` (rotation
-vector).
+The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row of the table
+describes one pose of the arm at rest. A row contains six joint angles (`j1_deg` ... `j6_deg`, or
+`j1_rad` ... `j6_rad`) and the names of two image files (`left`, `right`). Instead of images, a row
+can contain the pose of the board in the left camera's frame. The columns are then `board_x_m`,
+`board_y_m`, `board_z_m` (position of the board's first corner), and `board_rx_rad`, `board_ry_rad`,
+`board_rz_rad` (rotation vector).
 """
 
 from __future__ import annotations
@@ -65,19 +65,19 @@ BOARD_COLUMNS = (
 )
 
 MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
-"""The maximum joint motion (rad) and the minimum duration (s) of an arm at rest."""
+"""An arm is at rest if its joints move by at most this angle (rad) for this duration (s)."""
 
 MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
-"""The minimum rotation (rad) and translation (m) of the board between two recorded poses.
+"""The minimum rotation (rad) and translation (m) between a new and a recorded pose of the board.
 
-A pose is new if it meets one of the two minimums.
+A pose is new if it differs from each recorded pose by at least one of these two minimums.
 """
 
 SIMULATED_BASE_M, SIMULATED_BASE_RAD, SIMULATED_JOINT_RAD = 0.005, 0.01, 2e-4
-"""The standard deviations of the errors of a simulated arm.
+"""The standard deviations of the random errors of a simulated arm.
 
-The errors are the position (m) and rotation (rad) of its base relative to the scene, and the joint
-angles (rad).
+The first two apply to the position (m) and the rotation (rad) of the arm's base. The third applies
+to each joint angle (rad).
 """
 
 
@@ -93,7 +93,7 @@ def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRi
     """Return the lenses and poses of the stereo camera.
 
     If a calibration is given, it provides the lenses and the transform between them. Otherwise, the
-    scene provides them. The pose in the world is always from the scene.
+    scene provides them. The camera's pose in the world always comes from the scene.
     """
     measured = scene.camera if calibration is None else calibration
     pose = scene.camera.world_from_left
@@ -127,7 +127,7 @@ class PoseRow:
 
 
 def read_pose_table(folder: Path) -> list[PoseRow]:
-    """Read the table of arm poses in a folder.
+    """Read the table of arm poses from a folder.
 
     Raises ArmPosesError or BadInputError if the table is missing or invalid.
     """
@@ -172,12 +172,13 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
 def read_detections(
     folder: Path, board: Board, rig: LensRig, size: tuple[int, int], progress: Progress
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
-    """Read the table of arm poses in a folder, and detect the board in the images.
+    """Read the arm poses from a folder, and detect the calibration board in the images.
 
-    Return the detections, and (pose name, reason) for each pose in which the board was not
+    Return the detections. Also return (pose name, reason) for each pose in which the board was not
     detected.
 
-    rig: stereo camera. A board pose in the table is projected into its images.
+    rig: stereo camera. If the table contains board poses, the corners are projected into its
+        images.
     size: required (width, height) of the images, px.
 
     Raises ArmPosesError or BadInputError if the table is invalid, and CalibrationError if images
@@ -215,7 +216,7 @@ def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board
 
 
 def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
-    """Project the corners of a board with a known pose into both images, and add no noise.
+    """Project the corners of a board with a known pose into both images, without noise.
 
     Raises ArmPosesError if the board is behind a camera.
     """
@@ -237,7 +238,7 @@ class PoseRecorder:
     """A recorder that stores joint angles and images of a calibration board on an arm.
 
     It stores a pose whenever the arm is at rest and the board has a new pose. Joint angles and
-    images must be added in the order of their times (s, on one clock).
+    images must be added in the order of their times. All times (s) must come from the same clock.
     """
 
     def __init__(self, folder: Path, board: Board, rig: LensRig) -> None:
@@ -322,7 +323,10 @@ def _is_same_pose(pose: Floats, other: Floats) -> bool:
 
 
 def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
-    """Return a random pose world_from_base (4, 4) of a simulated arm near its pose in the scene."""
+    """Return the pose world_from_base (4, 4) of a simulated arm.
+
+    The pose deviates at random from the arm's pose in the scene.
+    """
     pose: Pose = getattr(scene.arms, side).world_from_base
     nominal = pose_matrix(pose)
     random = np.random.default_rng([seed, side == "left"])
@@ -337,8 +341,8 @@ class SimulatedArm:
 
     If an apparatus (true hardware parameters) is given, the arm has the base pose and the joint
     offsets of the apparatus. Each joint then rests at a random angle within its backlash.
-    Otherwise, the base deviates at random from the scene, and each joint has random errors with the
-    standard deviation SIMULATED_JOINT_RAD.
+    Otherwise, the base pose deviates at random from the scene, and each joint has random errors
+    with the standard deviation SIMULATED_JOINT_RAD.
     """
 
     def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:
@@ -387,7 +391,8 @@ def simulate_poses(
     The images have blur and noise. Yield the number of finished poses after each pose.
 
     places: number of poses.
-    apparatus: true parameters of camera and arms; None: the arms deviate at random from the scene.
+    apparatus: true parameters of the camera and the arms. If None, the arms deviate at random from
+        the scene.
 
     Raises BoardError if the board cannot be rendered.
     """

@@ -1,10 +1,10 @@
 """Fit a stereo camera and all board poses to the detected board corners by least squares.
 
-The unknowns are the parameters of the stereo camera, or rig (22, `PARAMETERS`), and the board's
-pose in each image pair (6). The corners of a pair depend only on the rig and on the pose of that
-pair, so the poses can be eliminated. A system of 22 equations remains (Schur complement; Triggs et
-al., Bundle Adjustment: A Modern Synthesis, 1999, section 6). The lens model is a pinhole with the
-distortion coefficients k1, k2, p1, p2.
+The unknowns are the 22 parameters of the stereo rig (`PARAMETERS`) and, for each image pair, the 6
+parameters of the board's pose. The corners in an image pair depend only on the rig and on the
+board's pose in that pair. The board poses can therefore be eliminated, and a system of 22 equations
+remains (Schur complement; Triggs et al., Bundle Adjustment: A Modern Synthesis, 1999, section 6).
+The lens model is a pinhole with the distortion coefficients k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ PARAMETERS = (
     *(f"right.{name}" for name in LENS),
     *(f"right_from_left.{name}" for name in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")),
 )
-"""The names of the 22 parameters of a stereo rig, in their order.
+"""The names of the 22 parameters of a stereo rig, in the order of the parameter vector.
 
-The names with rx, ry and rz are the components of a rotation vector.
+The parameters rx_rad, ry_rad and rz_rad are the components of a rotation vector.
 """
 
 LEFT, RIGHT, STAND = slice(0, 8), slice(8, 16), slice(16, 22)
 
 MAX_STEPS = 50
 CONVERGED_COST_CHANGE = 1e-9
-"""The relative change of the sum of squared residuals below which the iteration ends."""
+"""The iteration ends if the sum of squared residuals changes by less than this fraction."""
 
 
 class NotDeterminedError(FlexsheetError, ValueError):
@@ -49,12 +49,12 @@ class NotDeterminedError(FlexsheetError, ValueError):
 class RigFit:
     """A fitted stereo rig and the residuals of the fit.
 
-    rig: parameters (22,).
-    poses: board poses (pairs, 6) in the left camera's frame, each as a rotation vector and a
-        position.
-    residuals: detected minus projected positions (n, 2), in px, of the n corners in the left and in
-        the right image of each pair.
-    sigma_px: standard deviation of one coordinate of a corner.
+    rig: parameters (22,) of the stereo rig, in the order of `PARAMETERS`.
+    poses: board poses (number of pairs, 6) in the left camera's frame. Each row is a rotation
+        vector (rad) and a position (m).
+    residuals: for the left and the right image of each pair, detected minus projected positions (n,
+        2), in px, of the n detected corners.
+    sigma_px: standard deviation of the error of one pixel coordinate of a corner.
     covariance: covariance matrix (22, 22) of the parameters.
     """
 
@@ -65,7 +65,10 @@ class RigFit:
     covariance: Floats
 
     def pair_rms_px(self) -> Floats:
-        """Return the rms corner residuals (pairs, 2), in px, of the left and right images."""
+        """Return the rms residual (px) of the corners in each image.
+
+        The result has one row per image pair, and one column each for the left and the right image.
+        """
         return np.array([[rms_distance(view) for view in views] for views in self.residuals])
 
     def rms_px(self) -> float:
@@ -94,19 +97,26 @@ def lens_arrays(lens: Floats) -> tuple[Floats, Floats]:
 
 
 def pose_transform(pose: Floats) -> Floats:
-    """Convert a pose (6,), rotation vector (rad) and position (m), to a transform (4, 4)."""
+    """Convert a pose (6,) to a transform (4, 4).
+
+    The pose contains a rotation vector (rad) and a position (m).
+    """
     return rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:])
 
 
 def pose_vector(transform: Floats) -> Floats:
-    """Convert a transform (4, 4) to a pose (6,), rotation vector (rad) and position (m)."""
+    """Convert a transform (4, 4) to a pose (6,).
+
+    The pose contains a rotation vector (rad) and a position (m).
+    """
     return np.concatenate([rigid.vector_from_rotation(transform[:3, :3]), transform[:3, 3]])
 
 
 def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats, Floats]:
-    """Project points (n, 3), in m, to pixels (n, 2).
+    """Project n points (n, 3), in m, into an image.
 
-    Return the pixels and their derivatives with respect to the pose (2n, 6) and the lens (2n, 8).
+    Return the pixel positions (n, 2), and their derivatives with respect to the pose (2n, 6) and to
+    the lens parameters (2n, 8).
     """
     matrix, distortion = lens_arrays(lens)
     pixels, slope = cv2.projectPoints(points, pose[:3], pose[3:], matrix, distortion)
@@ -174,10 +184,10 @@ def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Line
 class _Reduced:
     """The normal equations of the rig after elimination of the board poses.
 
-    matrix: left-hand matrix (22, 22).
+    matrix: coefficient matrix (22, 22).
     side: right-hand side (22,).
-    poses: for each board pose, the inverse of its block (6, 6), its gradient (6,) and its coupling
-        to the rig (22, 6).
+    poses: for each board pose, the inverse of its diagonal block (6, 6), its right-hand side (6,),
+        and its coupling block (22, 6) with the rig.
     """
 
     matrix: Floats
@@ -188,7 +198,7 @@ class _Reduced:
 def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
     """Return the Levenberg-Marquardt equations of the rig, with the board poses eliminated.
 
-    damping: damping of the method; the diagonal is multiplied by 1 + `damping`.
+    damping: damping factor; the diagonal of the matrix is multiplied by 1 + `damping`.
     """
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []
@@ -205,7 +215,7 @@ def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
 
 
 def _scaled_inverse(matrix: Floats) -> Floats:
-    """Invert a symmetric positive definite matrix with different units in its rows.
+    """Invert a symmetric positive definite matrix whose rows have different units.
 
     Raises NotDeterminedError if the matrix is not positive definite or if it is nearly singular.
     """
@@ -231,7 +241,7 @@ def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Fl
 
     board: corners of the board (n, 3), m.
     rig: initial parameters (22,).
-    poses: initial board poses (pairs, 6) in the left camera's frame.
+    poses: initial board poses (number of pairs, 6) in the left camera's frame.
 
     Raises NotDeterminedError if the pairs do not determine the rig.
     """
@@ -283,10 +293,12 @@ def _split_views(linearized: Linearized, pair: BoardPair) -> tuple[Floats, Float
 
 
 def board_pose(view: BoardView, board: Floats, lens: Floats) -> Floats:
-    """Estimate the pose (6,) of the board in a camera's frame from one image.
+    """Estimate the board's pose in a camera's frame from one image.
+
+    Return a rotation vector (rad) and a position (m), together (6,).
 
     board: corners of the board (n, 3), m.
-    lens: lens parameters (8,).
+    lens: lens parameters (8,), as for `lens_arrays`.
     """
     points = board[view.ids]
     _, rotation, position = cv2.solvePnP(points, view.pixels, *lens_arrays(lens))

@@ -1,8 +1,9 @@
 """Select image pairs of a board for a stereo calibration while the camera is running.
 
 A pair is accepted if the board is at rest in a new pose and if the pair improves the coverage. The
-coverage is complete if there are enough pairs in total. There must also be enough pairs with the
-board in each cell of the images, at each tilt, and at each distance.
+coverage is complete if there are enough pairs in total, and enough pairs that meet each condition.
+A condition is that the board is in a certain cell of the images, has a certain tilt, or is at a
+certain distance.
 """
 
 from __future__ import annotations
@@ -26,27 +27,31 @@ from flexsheet.messages.scene import Lens
 from flexsheet.nodes.arrays import Floats, Image
 
 COLUMNS, ROWS = 4, 3
-"""The numbers of columns and rows of image cells in which the coverage is counted."""
+"""The numbers of columns and rows of cells into which an image is divided to count the coverage."""
 
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
 STILL_PX = 0.5
-"""The maximum motion (px) of the board's corners between two images of a board at rest."""
+"""The board is at rest if its corners move by less than this distance (px) between two images."""
 
 NEW_POSE_PX = 12.0
-"""The minimum median distance (px) of corners between a new pose and each accepted pose."""
+"""The minimum median displacement (px) of the board's corners since each accepted image pair.
+
+If the displacement is smaller, the pose of the board is not new.
+"""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""The minimum size of a board that counts as near, and the maximum size of one that counts as far.
+"""The relative sizes above which a board is near, and below which it is far.
 
-The size is the length of the board's diagonal divided by the length of the image's diagonal.
+The relative size is the length of the board's diagonal in the image, divided by the length of the
+image's diagonal.
 """
 
 
 class BinGroup(StrEnum):
-    """The kinds of conditions; the first missing kind determines the hint to the user."""
+    """The kinds of conditions, in the order in which the user is asked to meet the conditions."""
 
     TILT = "tilt"
     DISTANCE = "distance"
@@ -57,10 +62,10 @@ class BinGroup(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """A condition, such as an image cell or a tilt, that a minimum number of image pairs must meet.
+    """A condition that a minimum number of image pairs must meet, such as a tilt of the board.
 
-    name: one of `TILTS` or `DISTANCES`; empty for other groups.
-    cell: column and row of an image cell; None for other groups.
+    name: tilt or distance, one of `TILTS` or `DISTANCES`; empty if the group is neither.
+    cell: column and row of an image cell; None if the group is not a cell of an image.
     """
 
     group: BinGroup
@@ -71,9 +76,8 @@ class Bin:
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
     """Return the required number of image pairs for each condition, for a total of `pairs`.
 
-    Cells at the outer edges of the two images are excluded, because only one camera sees the board
-    there at most distances. These are the left edge of the left image and the right edge of the
-    right image.
+    No pairs are required in the first column of cells in the left image and in the last column in
+    the right image. At most distances, only one camera sees the board there.
     """
     count = max(1, round(0.1 * pairs))
     required = {Bin(BinGroup.PAIRS): pairs}
@@ -140,7 +144,7 @@ class Capture:
         return not self.missing()
 
     def missing(self) -> list[Bin]:
-        """Return the conditions for which more image pairs are required."""
+        """Return the conditions that too few image pairs have met so far."""
         return [one for one, count in self.needed.items() if self.counts[one] < count]
 
     def add_pair(self, left: Image, right: Image) -> PairAssessment:
@@ -215,7 +219,7 @@ POSES = {
 
 
 def describe_requirement(one: Bin) -> str:
-    """Return a required pose of the board in words, such as "at the top left of the left image"."""
+    """Describe where or how to show the board, such as "at the top left of the left image"."""
     if one.cell is None:
         return POSES[one.name]
     column, row = one.cell

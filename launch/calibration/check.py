@@ -42,10 +42,11 @@ from flexsheet.nodes.models.camera import camera_matrix
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """The parameters of a stereo camera in OpenCV's form.
+    """The parameters of a stereo camera in the form that OpenCV uses.
 
-    Each camera has a matrix (3, 3), in px, and distortion coefficients (5,). The transform from the
-    left to the right camera is a matrix (4, 4).
+    matrices: camera matrices (3, 3), in px, of the left and right camera.
+    distortions: distortion coefficients (5,) of the left and right camera.
+    right_from_left: transform (4, 4) from the left to the right camera's frame.
     """
 
     matrices: tuple[Floats, Floats]
@@ -54,13 +55,13 @@ class StereoRig:
 
     @staticmethod
     def from_fit(numbers: Floats) -> StereoRig:
-        """Make the stereo rig from the 22 parameters in a `RigFit`."""
+        """Make the stereo rig from the 22 fitted parameters (`PARAMETERS`)."""
         left, right = lens_arrays(numbers[LEFT]), lens_arrays(numbers[RIGHT])
         return StereoRig((left[0], right[0]), (left[1], right[1]), pose_transform(numbers[STAND]))
 
     @staticmethod
     def from_calibration(calibration: StereoCalibration) -> StereoRig:
-        """Make the stereo rig from a calibration."""
+        """Make the stereo rig from a stored stereo calibration."""
         left, right = (
             camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
             for lens in (calibration.left, calibration.right)
@@ -89,9 +90,9 @@ class BoardMeasurement:
 
 
 def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
-    """Triangulate pixel positions (n, 2) of both images by the linear method.
+    """Triangulate n points from their pixel positions (n, 2) in both images by the linear method.
 
-    Return points (n, 3), in m, in the left camera's frame.
+    Return the points (n, 3), in m, in the left camera's frame.
     """
     normalized = [
         cv2.undistortPoints(pixels[:, None], matrix, distortion)[:, 0].T
@@ -104,7 +105,9 @@ def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
 
 
 def compute_rigid_residuals(points: Floats, model: Floats) -> Floats:
-    """Return the distances (n,) between two sets of points (n, 3) after the best rigid alignment.
+    """Return the distances (n,) between n measured points and n model points after rigid alignment.
+
+    points, model: measured points and model points (n, 3).
 
     Source: Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
     """
@@ -142,9 +145,9 @@ def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasure
 
 
 def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: Floats) -> Floats:
-    """Return distances (2n,), in px, between detected corners and projected points.
+    """Return the distances (2n,), in px, between n detected corners and their projected points.
 
-    The n distances in the left image come first.
+    The n distances in the left image precede the n distances in the right image.
 
     left, right: detected corners (n, 2), px.
     points: triangulated points (n, 3), in m, in the left camera's frame.
@@ -161,7 +164,7 @@ def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: F
 
 
 def _rms(values: Floats) -> float | None:
-    """Return the root mean square of an array, or None for an empty array."""
+    """Return the root mean square of an array, or None if the array is empty."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
@@ -197,8 +200,8 @@ def check_stereo(
 ) -> dict[str, float | int | list[str] | None]:
     """Evaluate a stereo calibration with images of a board that were not used to calibrate.
 
-    Return the values of `summarize`. The value `used_to_calibrate` lists the left images that were
-    also used to calibrate. The errors of these images are underestimated.
+    Return the values of `summarize` and a list `used_to_calibrate`. The list names each left image
+    whose pair was also used to calibrate. The errors of such pairs are underestimated.
 
     Raises CalibrationError if the images have a wrong size or if no pair shows the board.
     """
@@ -266,8 +269,8 @@ PLAIN_HALF_WINDOW_PX = 5
 def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
     """Find chessboard corners in the same way as OpenCV's tutorials, for comparison.
 
-    The corners are refined in a fixed window of 11 px. Return None if the board is not found in
-    both images.
+    The corners are refined in a fixed window of 11x11 px. Return None if one of the images does not
+    show the board.
     """
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
     window = (PLAIN_HALF_WINDOW_PX, PLAIN_HALF_WINDOW_PX)
@@ -295,11 +298,10 @@ def cross_check(
 ) -> dict[str, object]:
     """Cross-validate a stereo calibration by measuring image pairs that it does not use.
 
-    The calibration is repeated with some pairs left out each time, and these pairs are measured.
-    The pairs are divided into G groups. The pairs i, i+G, i+2G, ... form one group, which is left
-    out together. Consecutive pairs are in different groups, because their images are similar. If
-    the board is a chessboard, the calibration of OpenCV's tutorials is evaluated in the same way,
-    for comparison.
+    The pairs are divided into groups. For each group, the camera is calibrated with all other
+    pairs, and the pairs of the group are measured. Consecutive pairs are in different groups,
+    because their images are similar. If the board is a chessboard, the calibration of OpenCV's
+    tutorials is evaluated in the same way, for comparison.
 
     leave_out: number of pairs in each group.
 

@@ -2,8 +2,8 @@
 
 This is called commissioning (`flexsheet commission`). The folder contains the state
 (`commission.json`), the calibration files, and a report. It also contains a scene and a launch file
-that use the calibration files. Each step starts from the scene with the results of all earlier
-steps. If a step is repeated, all later steps must therefore be run again.
+that use the calibration files. Each step uses the results of all earlier steps. If a step is
+repeated, all later steps must therefore be run again.
 """
 
 from __future__ import annotations
@@ -79,15 +79,16 @@ SIMULATED_STEP_S: Mapping[StepName, float] = {
 }
 """The median durations (s) of the steps in 30 simulated laboratories on two processor cores.
 
-Source: docs/results/robustness-commissioned-modern.json. The duration of a verification in a
-running graph was not measured there.
+Source: docs/results/robustness-commissioned-modern.json. That file has no duration for the
+verification in a running graph.
 """
 
 
 class NodeValue(LimitedModel):
     """A measured value of a node parameter.
 
-    The value applies to all nodes of a type, or only to the node of one arm.
+    The value applies to all nodes of the type `node_type`. If `side` is given, it applies only to
+    the node of that arm.
     """
 
     node_type: str
@@ -111,10 +112,10 @@ class StepResult(LimitedModel):
 
     residual: error of the fit in `unit`.
     advice: text that states what to do if the residual exceeds `limit`.
-    uncertainty: standard deviations. Their names end in their units.
-    scene_values: new values of the scene, by the dotted path of the key.
-    parameters: names of calibration files in the folder, by TYPE.PARAMETER of the nodes that use
-        them.
+    uncertainty: standard deviations by name. Each name ends in the unit.
+    scene_values: new values for the scene, by dotted path in the scene file.
+    parameters: names of calibration files in the folder. Each key TYPE.PARAMETER names a node type
+        and its parameter, which is set to the file name.
     node_values: measured values of other node parameters.
     missing: quantities that were not measured.
     figures: further results.
@@ -160,9 +161,9 @@ class State(LimitedModel):
 
 
 class MissingDataError(CommissionError):
-    """Raised by a step of a commissioning that needs data of real devices.
+    """Raised if a step of a commissioning needs data from real devices that were not given.
 
-    The text states how to capture the data.
+    The error text states how to capture the data.
     """
 
     code = "commission-data"
@@ -174,7 +175,7 @@ class MissingDataError(CommissionError):
 
 
 class VerificationError(CommissionError):
-    """Raised if the stroke of the verification fails in a running graph."""
+    """Raised if a running graph fails during the finger stroke that verifies the calibration."""
 
     code = "commission-verification"
     remedy = "Close other graphs, and run the same command again; finished steps are kept."
@@ -189,11 +190,12 @@ class Commissioning:
 
     If the folder contains a state, the sequence continues from this state.
 
-    launch_file, scene_file: files to start from.
+    launch_file, scene_file: launch file and scene from before the commissioning.
     apparatus: true parameters of a simulated laboratory, as given by --apparatus; None for real
         devices.
 
-    Raises CommissionError if the commissioning in the folder was started with other files.
+    Raises CommissionError if the commissioning in the folder was started with other files, or if
+    the folder contains other data.
     """
 
     folder: Path
@@ -262,8 +264,8 @@ class Commissioning:
     def expected_s(self, name: StepName) -> float | None:
         """Return the expected duration (s) of a step, or None if it is unknown.
 
-        A repeated step is expected to take as long as its last run. A first run in a simulated
-        laboratory is expected to take as long as in earlier measurements.
+        A repeated step is expected to take as long as its last run. For the first run of a step in
+        a simulated laboratory, the duration is taken from `SIMULATED_STEP_S`.
         """
         record = self.state.steps.get(name)
         if record is not None and record.result is not None:
@@ -350,7 +352,7 @@ class Commissioning:
 
 
 def _make_yaml(value: Any) -> Any:
-    """Convert a value for a YAML document, with each list on one line."""
+    """Convert a value so that each list is on one line in a YAML document."""
     if not isinstance(value, list):
         return value
     row = CommentedSeq([_make_yaml(one) for one in value])
@@ -417,11 +419,10 @@ def _verification_figures(state: State) -> Mapping[str, Any]:
 
 
 def format_verdict(state: State) -> list[str]:
-    """Return a line that states whether the laboratory meets all tolerances, then the doubts.
+    """Return lines of text that state whether the laboratory meets all tolerances.
 
-    Each doubt is one line.
-
-    The result is empty before the verification.
+    If this is in doubt, each reason for doubt follows on a line of its own. If the verification is
+    neither finished nor skipped, the result is empty.
     """
     record = state.steps.get(StepName.VERIFICATION)
     if record is None:
@@ -439,13 +440,13 @@ def format_verdict(state: State) -> list[str]:
 
 
 def is_good(state: State) -> bool:
-    """Return whether the laboratory is verified without a doubt."""
+    """Return whether the verification is finished and found no reason for doubt."""
     figures = _verification_figures(state)
     return bool(figures) and not figures.get("doubts")
 
 
 def _format_figures(figures: Mapping[str, Any]) -> list[str]:
-    """Return Markdown tables with the main figures of the verification.
+    """Return Markdown tables with the main results of the verification.
 
     The first table contains the metrics that have a tolerance.
     """
@@ -498,18 +499,18 @@ def _split_metric(metric: str) -> tuple[str, str]:
 
 
 MOVING = {"sheet_mm": ("delta_d_mm", "true_delta_d_mm"), "fingertip_mm": ("fingertip_mm",)}
-"""The metrics that are measured during the stroke, with their keys in the stroke's result.
+"""The metrics that are measured while the finger moves, with the keys of their measured values.
 
-The last key that exists is used.
+If the result of the stroke contains several of the keys, the last one is used.
 """
 
 
 def _find_measured_errors(figures: Mapping[str, Any]) -> dict[str, float]:
     """Return the measured errors by metric.
 
-    The errors of sheet and fingertip are means over the stroke. The other errors are measured at
-    rest. The true errors of real devices are unknown, so the result then contains only the sheet
-    error that the devices report.
+    The errors of the sheet and the fingertip are means over the stroke. The other errors are
+    measured at rest. For real devices, the true errors are unknown, and the result contains only
+    the sheet error that the devices report.
     """
     stroke = figures.get("stroke", {})
     found = dict(figures.get("at_rest", {}).get("after", {}))
@@ -531,8 +532,8 @@ def list_doubts(
     The list is empty if there are no reasons.
 
     figures: results of the step "verification".
-    tracking: error (mm) of the sheet during the stroke as the devices report it, and its tolerance
-        (mm).
+    tracking: sheet error (mm) that the devices report for the stroke, and the tolerance (mm) of
+        this error.
     check_command: command line that repeats the verification.
     """
     doubts = []
@@ -569,7 +570,10 @@ def list_doubts(
 
 
 def _describe_effects(figures: Mapping[str, Any]) -> str:
-    """Describe the latency and the lost messages during the stroke, in parentheses."""
+    """Return a text in parentheses with the latency and the number of lost messages in the stroke.
+
+    The text is empty if neither was measured.
+    """
     stroke = figures.get("stroke", {})
     effects = []
     latency_ms = stroke.get("latency_ms", {}).get("exposure_to_frame", {}).get("p50")
@@ -581,7 +585,7 @@ def _describe_effects(figures: Mapping[str, Any]) -> str:
 
 
 def list_limits(state: State) -> list[str]:
-    """Return texts that state what limits the accuracy, with the most important one first.
+    """Return texts that state what limits the accuracy, with the most important limit first.
 
     If the laboratory is verified, the first text names the metric that is nearest to its tolerance.
     The other texts name the uncertainties of the steps.
@@ -591,15 +595,18 @@ def list_limits(state: State) -> list[str]:
 
 
 SMALL_ERROR_RATIO = 0.5
-"""The maximum ratio of error at rest to error in motion for which the error at rest is small.
+"""An error at rest is small if it is at most this fraction of the error in motion.
 
-Independent errors add in quadrature. Below this ratio, the error at rest therefore causes at most a
-quarter of the mean square error in motion.
+The squares of independent errors add up. A small error at rest therefore causes at most a quarter
+of the mean square error in motion.
 """
 
 
 def _describe_nearest_metric(figures: Mapping[str, Any]) -> str | None:
-    """Describe the metric that is nearest to its tolerance; return None if none was measured."""
+    """Describe the metric that is nearest to its tolerance.
+
+    Return None if no metric was measured.
+    """
     measured = _find_measured_errors(figures)
     ratios = {
         metric: measured[metric] / one["tolerance"]
@@ -627,7 +634,7 @@ def _describe_nearest_metric(figures: Mapping[str, Any]) -> str | None:
 
 
 def _rank_uncertainties(state: State) -> list[str]:
-    """Return a text for each uncertainty in mm that a step found, with the largest first."""
+    """Return a text for each uncertainty that a step states in mm, with the largest first."""
     found = [
         (value, f"{name}: {key.removesuffix('_mm').replace('_', ' ')} {value:.2f} mm")
         for name, record in state.steps.items()

@@ -1,7 +1,7 @@
 """Detect the corners of calibration boards: complete chessboards and partly visible ChArUco boards.
 
-The id of a corner is its row in the array of `board_points`, which counts along the board's columns
-first. A corner has the same id in every image.
+The id of a corner is its index in the array that `board_points` returns. A corner has the same id
+in every image.
 """
 
 from __future__ import annotations
@@ -40,12 +40,15 @@ If there are fewer corners, the board's pose is inaccurate.
 """
 
 MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
-"""The minimum and maximum half side length (px of the enlarged image) of the refinement window."""
+"""The minimum and maximum of half the side length of the refinement window.
+
+The unit is a pixel of the enlarged image.
+"""
 
 MAX_REFINEMENT_PX = 1.0
-"""The maximum displacement (px) of a ChArUco corner by the refinement.
+"""A ChArUco corner is rejected if the refinement moves it by this distance (px) or more.
 
-A larger displacement indicates that the refinement found another edge.
+The refinement has then found another edge.
 """
 
 CHESSBOARD_SMOOTHING_PX = 1.0
@@ -71,7 +74,11 @@ class CalibrationError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """The board corners in one image, as ascending ids (n,) and pixel positions (n, 2)."""
+    """The n board corners that were detected in one image.
+
+    ids: ids (n,) of the corners, in ascending order.
+    pixels: positions (n, 2) of the corners in the image, px.
+    """
 
     ids: Ints
     pixels: Floats
@@ -90,7 +97,8 @@ class BoardPair:
     def common(self) -> tuple[Ints, Floats, Floats]:
         """Return the corners that both images show.
 
-        The result contains the ids (n,) and the pixel positions (n, 2) in the left and right image.
+        The result contains the ids (n,) of n corners, and their pixel positions (n, 2) in the left
+        and in the right image.
         """
         ids, in_left, in_right = np.intersect1d(
             self.left.ids, self.right.ids, assume_unique=True, return_indices=True
@@ -114,9 +122,9 @@ def ignore_progress(done: int, total: int, what: str) -> None:
 
 
 def board_points(board: Board) -> Floats:
-    """Return the corners (rows*columns, 3), in m, in the board's frame.
+    """Return the positions (n, 3), in m, of the n corners in the board's frame.
 
-    Corners are counted along the columns first.
+    The corners are listed row by row.
     """
     points = np.zeros((board.rows * board.columns, 3))
     grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2)
@@ -131,7 +139,7 @@ def describe(board: Board) -> str:
 
 
 def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's ChArUco board.
+    """Make the OpenCV object that describes a ChArUco board.
 
     Raises CalibrationError if the marker size or the dictionary is unsuitable.
     """
@@ -160,10 +168,10 @@ def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
 
 
 def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
-    """Make a ChArUco detector that accepts a corner next to only one marker.
+    """Make a ChArUco detector that accepts a corner even if only one adjacent marker is detected.
 
-    If two markers were required, as by default in OpenCV, a quarter of the corners would be lost,
-    mostly at the image's edge. Later steps correct or exclude wrong corners.
+    By default, OpenCV requires two markers. A quarter of the corners would then be lost, mostly at
+    the image's edge. Later steps correct or exclude wrong corners.
     """
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
@@ -173,7 +181,7 @@ def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
 class CornerFinder:
     """A detector of the corners of one calibration board.
 
-    quick: whether to reject images without a board by OpenCV's fast check.
+    quick: whether to use OpenCV's fast check, which rejects images that show no chessboard.
     """
 
     def __init__(self, board: Board, *, quick: bool = False) -> None:
@@ -277,9 +285,9 @@ def _refine_corners(
 def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
     """Renumber the corners (n, 2) of the right image to match the left image.
 
-    A detector can start at either end of the board, or at any corner of a square board. Because the
-    cameras of a stereo rig are nearly parallel, the matching numbering has the same directions in
-    both images.
+    A detector can start its numbering at either end of the board, or at any corner of a square
+    board. Because the cameras of a stereo rig are nearly parallel, the matching numbering has the
+    same directions in both images.
     """
     grid = right.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
@@ -337,7 +345,7 @@ def find_pairs(
     """Find the board in all image pairs.
 
     Return a list and the (width, height) of the images, in px. For each pair, the list contains the
-    corners, or the reason why there are none.
+    corners, or the reason why they were not found.
 
     Raises CalibrationError if there are no images, if the numbers of left and right images differ,
     or if images are unreadable or have different sizes.

@@ -14,9 +14,13 @@ SIDES: tuple[Side, Side] = ("left", "right")
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """Return the rows of a CSV file as (location FILE:LINE, values by column).
+    """Return (location, values by column) for each row of a CSV file.
 
-    Raises BadInputError if the file cannot be read, or if one of the columns is missing.
+    The location has the form FILE:LINE.
+
+    columns: names of all required columns.
+
+    Raises BadInputError if the file cannot be read, or if a column is missing.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -39,14 +43,14 @@ def read_table(
     check_header: Callable[[str, Sequence[str]], list[Problem]],
     problems: list[Problem],
 ) -> list[tuple[int, dict[str, str]]]:
-    """Return the rows of a CSV file as (line number, values by column).
+    """Return (line number, values by column) for each row of a CSV file.
 
-    Empty lines and lines that start with # are skipped. A row with a wrong number of values is
-    omitted, and appended to `problems`.
+    Empty lines and lines that start with # are skipped. If a row has a wrong number of values, the
+    row is omitted and a problem is appended to `problems`.
 
     columns: names of all permitted columns.
     check_header: function that returns further problems of the header. Its arguments are the
-        location of the header and the column names in it.
+        location of the header and the column names in the file.
 
     Raises BadInputError if the file cannot be read, is empty, or has wrong columns.
     """
@@ -91,14 +95,18 @@ def read_table(
 
 
 def list_missing(where: str, names: Sequence[str], wanted: Sequence[str]) -> list[Problem]:
-    """Return a problem for each wanted column that the header of a file does not contain."""
+    """Return a problem for each wanted column that is missing in the header of a file.
+
+    where: location of the header.
+    names: column names in the header.
+    """
     return [
         Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
     ]
 
 
 def parse_side(where: str, name: str, text: str, problems: list[Problem]) -> Side:
-    """Convert the text in the column `name` to a side.
+    """Convert the text in the column `name` to the side "left" or "right".
 
     If the text is neither "left" nor "right", append a problem to `problems` and return "left".
     """

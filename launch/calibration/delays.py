@@ -1,9 +1,9 @@
 """Measure the delays of the arms and the camera.
 
 The servo lag is the time by which an arm lags behind its commands. The node that controls an arm
-measures the lag from commanded and measured joint angles. The node starts with the lag in the
-launch file, and its self-check reports a deviation from that value. Therefore, the measured lag is
-written to the launch file.
+measures the lag from commanded and measured joint angles. At its start, the node reads the expected
+lag from the launch file. Its self-check reports if the measured lag deviates from the expected lag.
+Therefore, the measured lag is written to the launch file.
 
 The stamp offset is the time of an exposure minus its timestamp. The camera sees the marks on both
 clamps while the arms move the sheet. The motion of the marks in the images is compared with the
@@ -53,21 +53,23 @@ STROKE_S = 5.0
 """The duration (s) of the simulated stroke of the finger."""
 
 BLOCK_S, MIN_BLOCKS = 2.0, 4
-"""The duration (s) and the minimum number of the parts into which a recording is divided.
+"""A recording is divided into parts of this duration (s), and this number of parts is required.
 
-The stamp offset is measured in each part, and the results are averaged.
+The stamp offset (exposure time minus timestamp) is measured in each part, and the results are
+averaged.
 """
 
 STAMP_MODEL_STD_S = 1.5e-4
-"""The standard deviation (s) of the error of the stamp offset due to backlash and elasticity.
+"""The standard deviation (s) of the error that backlash and elasticity cause in the stamp offset.
 
-The error was 0.1 ms rms in simulated laboratories with seeds 0 to 9.
+The stamp offset is the time of an exposure minus its timestamp. The error was 0.1 ms rms in
+simulated laboratories with seeds 0 to 9.
 """
 
 MARK_SWING_M, MARK_FREQUENCY_HZ, MARK_SECONDS = 0.02, 1.0, 8.0
 """The amplitude (m), frequency (Hz) and duration (s) of the simulated motion of the sheet.
 
-This motion is used to measure the stamp offset.
+This motion is used to measure the stamp offset (exposure time minus timestamp).
 """
 
 
@@ -80,7 +82,7 @@ class DelaysError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLag:
-    """A measured delay, such as the servo lag of an arm, and its standard deviation (s)."""
+    """A measured delay (s), such as the servo lag of an arm, and its standard deviation (s)."""
 
     lag_s: float
     uncertainty_s: float
@@ -90,8 +92,8 @@ class MeasuredLag:
 class MeasuredDelays:
     """The measured delays of the arms and the camera.
 
-    servo: servo lag of each arm, including the latency of its commands.
-    stamp_offset: exposure time minus timestamp; None if the data do not contain it.
+    servo: servo lag of each arm, including the latency of the commands to the arm.
+    stamp_offset: exposure time minus timestamp; None if it could not be measured.
     """
 
     servo: dict[Side, MeasuredLag]
@@ -173,7 +175,7 @@ def estimate_stamp_offset(
     Return None if the marks are visible and moving in fewer than MIN_BLOCKS parts of the recording.
 
     pairs: image pairs with their timestamps (ns).
-    edges: motion of each clamp as computed from measured joint angles.
+    edges: motion of each clamp, computed from measured joint angles.
     detector: detector of the marks.
     """
     seen: list[list[tuple[int, Floats]]] = [[] for _ in edges]
@@ -241,8 +243,8 @@ def _average(values: Sequence[float], model_std_s: float) -> MeasuredLag:
 def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side, MeasuredLag]:
     """Simulate a stroke of the finger, and return the measured servo lags of both arms.
 
-    The node that controls an arm measures its servo lag. Raises DelaysError if it cannot be
-    measured.
+    The node that controls an arm measures its servo lag. Raises DelaysError if a servo lag cannot
+    be measured.
     """
     found = follow_in_simulated_time(scene, stroke_path(scene, STROKE_S), apparatus)
     lags_ms, uncertainties_ms = found["servo_lag_ms"], found["servo_lag_uncertainty_ms"]
@@ -260,7 +262,9 @@ def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side,
 def measure_in_simulation(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> MeasuredDelays:
-    """Measure the servo lags of simulated arms and the timestamp offset of a simulated camera.
+    """Measure the servo lags of simulated arms and the stamp offset of a simulated camera.
+
+    The stamp offset is the time of an exposure minus its timestamp.
 
     calibration: stereo calibration that is used to triangulate the marks. If it is None, the
         scene's camera model is used.
@@ -275,8 +279,8 @@ def swing_sheet(
 ) -> tuple[tuple[SampledMotion, ...], tuple[SampledMotion, ...]]:
     """Simulate arms that move the sheet periodically along its y axis, after one second at rest.
 
-    Return the true motions of both clamps, and their motions as computed from measured joint
-    angles.
+    Return the true motions of both clamps. Also return the motions that are computed from measured
+    joint angles.
 
     swing_m: amplitude of the motion.
     frequency_hz: frequency of the motion.
@@ -303,7 +307,7 @@ def swing_sheet(
 def draw_exposures(
     scene: Scene, apparatus: Apparatus, end_ns: int, seed: int
 ) -> Iterable[tuple[int, int]]:
-    """Yield (timestamp, true time) of each simulated exposure, in ns.
+    """Yield the timestamp (ns) and the true time (ns) of each simulated exposure.
 
     end_ns: time after which no exposures are simulated.
     """
@@ -320,8 +324,7 @@ def simulate_stamp_offset(
 ) -> MeasuredLag | None:
     """Measure the stamp offset (exposure time minus timestamp) of a simulated camera.
 
-    The images of the marks on the moving clamps are simulated. Return None if too few marks are
-    detected.
+    The camera observes marks on the moving clamps. Return None if too few marks are detected.
     """
     true, reported = swing_sheet(
         scene, apparatus, swing_m=MARK_SWING_M, frequency_hz=MARK_FREQUENCY_HZ, seconds=MARK_SECONDS

@@ -1,8 +1,9 @@
 """Measure the latency of the projector with the stereo camera.
 
-The renderer switches the projected image between white and black at random times, which the
-messages of its frames contain. Each camera image of the sheet shows the old or the new state, and
-therefore limits the possible latency. The latency is estimated from all images together.
+The renderer switches the projected image between white and black at random times. It publishes
+these times in its messages about frames. A camera image of the sheet shows the state before or
+after a switch, and therefore limits the possible latency. The latency is estimated from all images
+together.
 """
 
 from __future__ import annotations
@@ -35,14 +36,18 @@ JITTERS_S = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
 ERROR_RATES = (0.003, 0.01, 0.03, 0.1, 0.2)
 """The fractions of wrongly classified images that the estimation considers.
 
-`JITTERS_S` contains the standard deviations (s) that it considers for the errors of the times.
+For the errors of the measured times, the estimation considers the standard deviations (s) in
+`JITTERS_S`.
 """
 
 MIN_CONTRAST = 3.0
-"""The minimum difference in grey levels between images of the white and of the black state."""
+"""The minimum difference in grey level between camera images of a white and a black projection."""
 
 SIMULATED_SWITCHES, LEVELS = 60, 16
-"""The number of simulated switches, and of brightness levels of a partly lit exposure."""
+"""The number of simulated switches, and the number of brightness steps between black and white.
+
+A camera image has an intermediate brightness if the light changes during the exposure.
+"""
 
 
 class DisplayLatencyError(FlexsheetError, ValueError):
@@ -56,11 +61,11 @@ class DisplayLatencyError(FlexsheetError, ValueError):
 class SwitchImage:
     """A camera image that was taken after a switch of the projected image.
 
-    switched_s: time when the renderer switched to the new state.
-    start_s, end_s: start and end of the exposure.
-    is_new: whether the camera image shows the new state.
+    switched_s: time when the renderer switched the projected image.
+    start_s, end_s: start and end of the camera's exposure.
+    is_new: whether the camera image shows the state after the switch.
 
-    All times are in seconds on one clock.
+    All times are in seconds of the same clock.
     """
 
     switched_s: float
@@ -72,10 +77,10 @@ class SwitchImage:
 def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
     """Estimate the latency (s) from a switch of the image to the change of the light on the sheet.
 
-    The model assumes that an image shows the new state if the light changed before the middle of
-    its exposure. The times have unknown errors, and an unknown fraction of the images is classified
-    wrongly. The result is the mean and the standard deviation of the posterior distribution with a
-    uniform prior.
+    The model assumes that a camera image shows the state after the switch if the light changed
+    before the middle of the exposure. The times have unknown errors, and an unknown fraction of the
+    images is classified wrongly. The result is the mean and the standard deviation of the posterior
+    distribution with a uniform prior.
 
     Raises DisplayLatencyError if there are too few switches, or if the images do not show the
     switches.
@@ -94,8 +99,8 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
     late = ages_s > MAX_LATENCY_S
     if late.sum() < MIN_SWITCHES or is_new[late].mean() < 0.5:
         raise DisplayLatencyError(
-            f"only {int(is_new[late].sum())} of {int(late.sum())} images later than "
-            f"{1e3 * MAX_LATENCY_S:.0f} ms after a switch show the new state"
+            f"only {int(is_new[late].sum())} of {int(late.sum())} images that were taken more than "
+            f"{1e3 * MAX_LATENCY_S:.0f} ms after a switch show the new state; record more switches"
         )
     latencies_s = np.arange(0.0, MAX_LATENCY_S, STEP_S)
     logs = []
@@ -113,10 +118,12 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
 def classify_images(
     switches: Sequence[tuple[float, bool]], exposures: Iterable[tuple[float, float, float]]
 ) -> list[SwitchImage]:
-    """Decide from their brightness whether images show the new or the old projected state.
+    """Decide for each camera image whether it shows the state after the last switch.
 
-    switches: (time in s, whether the new state is white) of each switch between white and black.
-    exposures: (start in s, end in s, mean grey level) of each image.
+    The decision depends on the brightness of the image.
+
+    switches: time (s) of each switch between white and black, and whether the new image is white.
+    exposures: for each camera image, start (s) and end (s) of the exposure, and mean grey level.
 
     Raises DisplayLatencyError if all images have a similar brightness.
     """
@@ -140,7 +147,7 @@ def classify_images(
 
 
 def read_switch_images(bag: Path, stamp_offset_s: float = 0.0) -> list[SwitchImage]:
-    """Read from a bag the camera images that follow each switch of the projected image.
+    """Read a bag, and return the camera images that follow each switch of the projected image.
 
     Return an empty list if the bag contains no switch.
 
@@ -175,7 +182,7 @@ def simulate_switch_images(
 ) -> list[SwitchImage]:
     """Simulate camera images of the sheet while a simulated projector switches its image.
 
-    The simulated projector displays an image immediately after its latency.
+    The simulated projector displays an image as soon as its latency has passed.
 
     stamp_offset_s: measured time of an exposure minus its timestamp.
     """

@@ -4,15 +4,15 @@ A mark with the position m in the frame of the clamped edge is measured at the w
 
 world_from_base exp(b) forward(q + d) flange_from_edge exp(e) m + c f
 
-where q are the reported joint angles and f is the force of the stretched sheet on the edge. The
-unknowns are the pose error b of the base, the pose error e of the edge, the joint offsets d, and
-the compliance c of the flange. A pose error consists of a rotation vector and a translation, and
-exp converts it to a matrix.
+where forward is the arm's forward kinematics, q are the reported joint angles, and f is the force
+of the stretched sheet on the edge. The unknowns are the pose errors b of the base and e of the
+edge, the joint offsets d, and the compliance c of the flange. A pose error consists of a rotation
+vector and a translation, and exp converts it to a matrix.
 
-The marks determine the total effect of the unknowns, but not each unknown. In the measured working
-range, the total effect is sufficient. Each unknown therefore has a normal prior distribution, and
-the fit maximizes the posterior probability. The same camera measures the finger, so errors of the
-camera's pose and lenses cancel.
+The marks determine the total effect of the unknowns, but not each unknown. This is sufficient for
+positions in the measured working range. To make the solution unique, each unknown has a normal
+prior distribution, and the fit maximizes the posterior probability. The same camera measures the
+finger, so errors of the camera's pose and lenses cancel.
 """
 
 from __future__ import annotations
@@ -38,30 +38,30 @@ from flexsheet.nodes.models.rigid import (
 from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
-"""The indices of the unknowns in the vector (19,) of the fit.
+"""The indices of four groups of unknowns in the vector (19,) that is fitted.
 
-The unknowns are the pose error of the base, the joint offsets, the pose error of the edge, and the
+The groups are the pose error of the base, the joint offsets, the pose error of the edge, and the
 compliance of the flange.
 """
 
 PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
-"""The standard deviations (19,) of the prior distribution of the unknowns, in rad, m and m/N."""
+"""The standard deviations (19,) of the prior distributions of the unknowns, in rad, m and m/N."""
 
 PRIOR_COMPLIANCE_M_PER_N = 7.5e-5
 MAX_COMPLIANCE_M_PER_N = 1e-2
 
 INITIAL_SIGMA_M, MIN_SIGMA_M = 2e-4, 1e-6
-"""The initial and the minimum standard deviation (m) of a measured coordinate of a mark."""
+"""The initial and the minimum standard deviation (m) of the error of a measured mark, per axis."""
 
 OUTLIER_SIGMAS = 3.0
 """The residual, in standard deviations, above which the Huber loss of the fit is linear.
 
-Source: Huber 1964.
+Source: Huber, Robust estimation of a location parameter (1964).
 """
 
 MIN_POSES = 8
 MAX_RESIDUAL_M = 1e-3
-"""The maximum root mean square (m) of the residuals of a valid fit.
+"""A fit is valid if the root mean square (m) of its residuals is at most this value.
 
 Larger residuals indicate that marks, arms or joint angles have been exchanged.
 """
@@ -81,8 +81,8 @@ class EdgeFitError(FlexsheetError, ValueError):
 class EdgeMark:
     """A measured mark on the clamp of an arm.
 
-    mark_edge_m: known position (3,) of the mark in the frame of the edge.
-    position_world_m: measured position (3,) of the mark.
+    mark_edge_m: known position (3,) of the mark in the frame of the clamped edge.
+    position_world_m: measured position (3,) of the mark in the world.
     """
 
     side: Side
@@ -111,8 +111,8 @@ class EdgeFit:
 
     residual_rms_m: rms distance between measured and fitted positions of the marks.
     edge_std_m: standard deviation of a mark's fitted position, with all three axes combined.
-    compliance_std_m_per_n: standard deviation of the compliance.
-    covariance: covariance (19, 19) of the unknowns.
+    compliance_std_m_per_n: standard deviation of the flange's compliance.
+    covariance: covariance (19, 19) of the unknowns of the fit.
     """
 
     arm: ArmSpec
@@ -126,9 +126,9 @@ class EdgeFit:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A measured mark with the arm's joint angles and the force (3,) of the sheet on the edge.
+    """A measured mark, with the joint angles of the arm and the force of the sheet on the edge.
 
-    The force (N) is in the world frame.
+    force_n: force (3,) in the world frame.
     """
 
     joints_rad: Floats

@@ -38,31 +38,34 @@ JOINT_COLUMNS = tuple(f"{side}_j{number}_deg" for side in SIDES for number in ra
 COLUMNS = ("pose", "side", "along_mm", "x_mm", "y_mm", "z_mm", *JOINT_COLUMNS)
 """The columns of the CSV file of marks, which has one row for each mark in each pose.
 
-They contain the number of the pose, the arm, and the position of the mark along the clamped edge
-from its centre. The other columns contain the measured position in the world and the joint angles
-of both arms.
+`pose` is the number of the pose, and `side` is the arm. `along_mm` is the position of the mark
+along the clamped edge, relative to the edge's centre. The other columns contain the mark's measured
+position in the world and the joint angles of both arms.
 """
 
 MAX_PROBLEMS = 20
 
 ALONG = (-0.45, 0.0, 0.45)
-"""The positions of the simulated marks from the edge's centre, as fractions of its length."""
+"""The positions of the simulated marks along the clamped edge, as fractions of the edge's length.
+
+The edge's centre has the position 0.
+"""
 
 SIMULATED_POSES = 24
 MAX_TRIES = 400
 TILT_RAD = np.array([0.5, 0.35, 0.1])
 CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
 MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
-"""The minimum stretch ratio of the simulated sheet, and a factor that limits the maximum.
+"""The minimum stretch ratio of the simulated sheet, and the used fraction of a range.
 
-The factor is the used fraction of the range from the minimum to the scene's maximum stretch ratio.
+The range extends from this minimum to the maximum stretch ratio in the scene.
 """
 
 SEARCH_M = 0.02
 """The maximum distance (m) between a detected mark and its expected position."""
 
 MIN_NEW_JOINT_RAD = 0.02
-"""The minimum rotation (rad) of at least one joint between two recorded poses."""
+"""A pose is new if at least one joint differs by this angle (rad) from each recorded pose."""
 
 
 def read_edge_marks(path: Path) -> list[HeldPose]:
@@ -87,7 +90,7 @@ def read_edge_marks(path: Path) -> list[HeldPose]:
 
 
 def make_detector_config() -> DetectorConfig:
-    """Return the settings of a marker detector, from the default parameters of the triangulator."""
+    """Make the settings of a marker detector from the triangulator's default parameters."""
     given = TriangulatorParameters()
     return DetectorConfig(
         blob_filter=BlobFilter(
@@ -119,10 +122,11 @@ class MarkDetector:
     ) -> Floats | None:
         """Return the position (3,), in m, of the mark near an expected position.
 
-        Return None if no mark is found, or if several detected marks are possible.
+        Return None if no mark or several marks are found near the expected position.
 
         near_world_m: expected position (3,).
-        left_origin_px, right_origin_px: column and row of the first pixel of a cropped image.
+        left_origin_px, right_origin_px: column and row, in the full image, of the first pixel of a
+            cropped image.
         """
         found = detect_all(
             left,
@@ -143,7 +147,7 @@ class EdgeMarkRecorder:
     """A recorder that writes positions of marks on both clamps to a CSV file.
 
     It records a pose whenever both arms are at rest in a new pose. Joint angles and images must be
-    added in the order of their times (s, on one clock).
+    added in the order of their times. All times (s) must come from the same clock.
     """
 
     def __init__(self, path: Path, scene: Scene, calibration: StereoCalibration | None) -> None:
@@ -209,7 +213,7 @@ def simulate_edge_marks(
     angle within its backlash. Marks that the triangulator's detector rejects are omitted.
 
     apparatus: true parameters of the simulated hardware.
-    calibration: camera parameters that the detector uses; None: the scene's parameters.
+    calibration: camera parameters for the detector. If None, the scene's parameters are used.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)
@@ -246,7 +250,7 @@ def _draw_edges(scene: Scene, random: np.random.Generator) -> tuple[Floats, Floa
 
 
 def rest(position: Floats, _time_s: float) -> Floats:
-    """Return a constant position (3,), as the motion of a mark at rest."""
+    """Return the position (3,) of a mark at rest, which does not depend on the time."""
     return position
 
 
@@ -259,7 +263,7 @@ def _see_marks(
 ) -> list[EdgeMark]:
     """Return the marks of both clamps that the detector finds in simulated images.
 
-    expected_edges, true_edges: expected and true poses (4, 4) of the left and right edge.
+    expected_edges, true_edges: expected and true poses (4, 4) of the left and right clamped edge.
     """
     marks = []
     for side, expected, true in zip(SIDES, expected_edges, true_edges, strict=True):

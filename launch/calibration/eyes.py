@@ -2,10 +2,10 @@
 
 The projector shows a cross on the sheet. The viewer closes one eye and moves a bead, which is
 between the eye and the sheet, until it covers the cross. The stereo camera measures the positions
-of bead and cross. The eye is on the straight line through both points, and the lines for several
-bead positions intersect at the eye. This method is used in augmented reality (active alignment,
-Tuceryan and Navab 2000). It measures the centre of projection of the eye, and needs no calibration
-of projector or sheet.
+of the bead and the cross. The eye is on the straight line through both points, and the lines for
+several bead positions intersect at the eye. This method is used in augmented reality (active
+alignment, Tuceryan and Navab 2000). It measures the centre of projection of the eye, and needs no
+calibration of the projector or the sheet.
 """
 
 from __future__ import annotations
@@ -40,20 +40,22 @@ POINTS = ("bead", "cross")
 COLUMNS = ("eye", *(f"{point}_{axis}_mm" for point in POINTS for axis in "xyz"))
 """The columns of the CSV file of alignments, which has one row for each alignment.
 
-They contain the open eye (left or right), and the measured world positions (mm) of bead and cross.
+`eye` is the open eye (left or right). The other columns contain the measured world positions (mm)
+of the bead and the cross.
 """
 
 MIN_ALIGNMENTS = 6
 OUTLIER_RATIO = 2.0
-"""The multiple of the median distance above which the Huber loss of the fit is linear.
+"""The distance, as a multiple of the median, above which the Huber loss of the fit is linear.
 
-Source: Huber 1964.
+Source: Huber, Robust estimation of a location parameter (1964).
 """
 
 MAX_ANGLE_RAD = 0.02
 """The maximum rms angle (rad) between bead and cross, as seen from the fitted eye.
 
-A larger angle indicates that the eyes, or bead and cross, have been exchanged in the file.
+A larger angle indicates that the eyes, or the bead and the cross, have been exchanged in the CSV
+file.
 """
 
 MAX_SHIFT_M = 0.3
@@ -69,7 +71,10 @@ ALIGNMENT_S = 6.0
 """The time (s) between two simulated alignments."""
 
 HEAD_REST_SWAY_M = 1.5e-3
-"""The maximum standard deviation (m) of head motion on the chin rest that the viewer must use."""
+"""The maximum standard deviation (m) of the head's motion while it is on a chin rest.
+
+The viewer must use a chin rest during the measurement.
+"""
 
 
 class EyesError(FlexsheetError, ValueError):
@@ -86,7 +91,7 @@ class EyesError(FlexsheetError, ValueError):
 class Alignment:
     """A bead and a cross that appear at the same point to one eye.
 
-    The measured positions (3,) of both are in metres in the world frame.
+    bead_m, cross_m: measured positions (3,) in the world.
     """
 
     eye: Side
@@ -98,7 +103,7 @@ class Alignment:
 class EyesFit:
     """The fitted positions of both eyes, with their uncertainty.
 
-    angle_rms_rad: rms angle between bead and cross, as seen from the fitted eye.
+    angle_rms_rad: rms angle between bead and cross, as seen from the fitted eyes.
     covariance_m2: covariance (3, 3) of the midpoint between the eyes.
     interocular_std_m: standard deviation of the distance between the eyes.
     """
@@ -220,12 +225,12 @@ def simulate_alignments(
 ) -> list[Alignment]:
     """Simulate the alignments of a viewer, as measured by the simulated stereo camera.
 
-    The arms hold the flat sheet at the imaginary screen. An alignment is omitted if the viewer does
-    not see the sheet behind the bead. It is also omitted if the camera does not detect the bead or
-    the cross.
+    The arms hold the flat sheet at the origin of the world. An alignment is omitted if the viewer
+    does not see the sheet behind the bead. It is also omitted if the camera does not detect the
+    bead or the cross.
 
     apparatus: true parameters of the simulated hardware.
-    calibration: camera parameters that the detector uses; None: the scene's parameters.
+    calibration: camera parameters for the detector. If None, the scene's parameters are used.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

@@ -1,9 +1,9 @@
 """Generate Gray-code patterns for structured light, and decode camera images of the patterns.
 
-A camera pixel is wider than a projector pixel, so the finest stripes are not resolved. Each image
-is decoded to cells of a few projector pixels. To find the image position of a projector pixel with
-subpixel accuracy, a quadratic map is fitted to the cells around it. Moreno and Taubin (2012) fit
-local homographies instead.
+A camera pixel is wider than a projector pixel, so the camera does not resolve the finest stripes.
+For each camera pixel, decoding finds a cell of a few projector pixels that lights it. To find the
+image position of a projector pixel with subpixel accuracy, a quadratic map is fitted to the cells
+around this pixel. Moreno and Taubin (2012) fit local homographies instead.
 """
 
 from __future__ import annotations
@@ -21,16 +21,20 @@ MIN_CONTRAST = 24
 """The minimum difference in grey levels between white and black at a lit camera pixel."""
 
 MIN_STRIPE_PX = 4
-"""The width of the finest stripes that are decoded, in projector pixels."""
+"""The width (projector pixels) of the finest stripes that are decoded."""
 
 WINDOW_HALF_PX = 22.0
-"""Half the side length (projector pixels) of the window in which the map is fitted."""
+"""Half the side length (projector pixels) of the window in which a quadratic map is fitted.
+
+The map converts positions in the projector image to camera pixels.
+"""
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
-"""The maximum rms residual (camera pixels) of a fit, divided by `MIN_STRIPE_PX`.
+"""The maximum rms residual of the fit of a quadratic map from projector pixels to camera pixels.
 
-A larger residual indicates that the window contains an edge or a fold of the sheet.
+The limit in camera pixels is this value times `MIN_STRIPE_PX`. A larger residual indicates that the
+window contains an edge or a fold of the sheet.
 """
 
 
@@ -49,7 +53,10 @@ def make_patterns(width_px: int, height_px: int) -> list[Image]:
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:
-        raise DecodeError(f"OpenCV cannot generate a Gray code of {width_px}x{height_px} pixels")
+        raise DecodeError(
+            f"OpenCV cannot generate a Gray code of {width_px}x{height_px} pixels; correct the "
+            "size of the projector's image"
+        )
     white = np.full((height_px, width_px), 255, np.uint8)
     return [*(np.asarray(image, np.uint8) for image in images), white, np.zeros_like(white)]
 
@@ -58,9 +65,9 @@ def make_patterns(width_px: int, height_px: int) -> list[Image]:
 class Decoded:
     """The correspondence between camera pixels and projector pixels, as decoded from images.
 
-    pixels: lit camera pixels (n, 2).
-    lit_by: projector pixels (n, 2) that light these camera pixels. Each is the centre of a cell of
-        several projector pixels.
+    pixels: positions (n, 2) of the n lit camera pixels.
+    lit_by: projector pixels (n, 2) that light these camera pixels. Each value is the centre of a
+        cell of several projector pixels.
     """
 
     pixels: Floats
@@ -68,7 +75,9 @@ class Decoded:
 
 
 def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> Decoded:
-    """Decode the images (height, width) of one camera, in the order of `make_patterns`.
+    """Decode the images (height, width) that one camera took of the patterns.
+
+    The images must be in the order in which `make_patterns` returns the patterns.
 
     width_px, height_px: size of the projected image.
 
@@ -79,7 +88,7 @@ def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> D
     expected = 2 * sum(bits) + 2
     if len(images) != expected:
         raise DecodeError(
-            f"there are {len(images)} images of {expected} patterns; give one image per pattern"
+            f"there are {len(images)} images, but {expected} patterns; give one image per pattern"
         )
     if len({image.shape for image in images}) != 1:
         raise DecodeError(
@@ -111,11 +120,11 @@ def _bits(size_px: int) -> int:
 
 
 def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
-    """Find the camera pixels that show given projector pixels.
+    """Find the camera pixels that show n given projector pixels.
 
-    Return camera pixels (n, 2), and a mask (n,) that is true if the pixel was found.
+    Return camera pixels (n, 2), and a mask (n,) that is true for each pixel that was found.
 
-    projector_px: projector pixels (n, 2).
+    projector_px: given projector pixels (n, 2).
     """
     found, valid = np.zeros((len(projector_px), 2)), np.zeros(len(projector_px), np.bool_)
     order = np.argsort(view.lit_by[:, 0], kind="stable")
@@ -136,10 +145,10 @@ def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
 def _fit_pixel(offsets: Floats, pixels: Floats) -> Floats | None:
     """Fit a quadratic map from offsets in the projector image to camera pixels.
 
-    Return the camera pixel (2,) at offset 0. Return None if the residual is too large, or if cells
-    are missing on one side.
+    Return the camera pixel (2,) at offset 0. Return None if the residual is too large, or if one
+    quadrant around offset 0 contains no cells.
 
-    offsets: offsets (n, 2) of decoded cells, divided by half the window's side (-1..1).
+    offsets: offsets (n, 2) of n decoded cells, divided by half the window's side (-1..1).
     pixels: camera pixels (n, 2) of these cells.
     """
     for _ in range(2):

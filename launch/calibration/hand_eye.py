@@ -4,17 +4,17 @@ This is robot-world/hand-eye calibration. Each of several poses of the arm satis
 
 world_from_base base_from_flange(joints) flange_from_board = world_from_left left_from_board
 
-where the first and the third transform are unknown. A closed form gives initial values (Shah,
-Solving the robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms
-Robotics 5(3), 2013). Then all unknowns are fitted to all corners of all images.
+where the transforms world_from_base and flange_from_board are unknown. A closed form gives initial
+values (Shah, Solving the robot-world/hand-eye calibration problem using the Kronecker product, J.
+Mechanisms Robotics 5(3), 2013). Then all unknowns are fitted to all corners of all images.
 
-The real flange deviates from the forward kinematics by some tenths of a millimetre. All corners of
-an image pair have this error in common. Therefore, the model contains a small random flange motion
-for each pose. The standard deviations of this mixed model are estimated by restricted maximum
-likelihood (REML; Patterson and Thompson, Biometrika 58(3), 1971). If all corners were treated as
-independent, the uncertainty would be underestimated several times.
+The real flange deviates from the forward kinematics by some tenths of a millimetre. In a pair of
+images, all corners are affected by the same deviation. Therefore, the model contains a small random
+flange motion for each pose. The standard deviations of this mixed model are estimated by restricted
+maximum likelihood (REML; Patterson and Thompson, Biometrika 58(3), 1971). If all corners were
+treated as independent, the uncertainty would be underestimated several times.
 
-A motion (6,) is a rotation vector (rad), then a translation (m).
+In this module, a motion (6,) is a rotation vector (rad) followed by a translation (m).
 """
 
 from __future__ import annotations
@@ -53,31 +53,30 @@ RANDOM_STARTS = 60
 SUBSET_POSES = 5
 """The number of poses in each random subset from which initial values are computed.
 
-Subsets are used in case some poses are wrong.
+Some subsets then contain no wrong poses, even if a few poses are wrong.
 """
 
 LENGTH_M = 0.3
-"""The translation (m) that contributes as much to a pose's error as a rotation of one radian."""
+"""The translation (m) that counts as much as a rotation of one radian in the error of a pose."""
 
 MAX_MEDIAN_RATIO = 6.0
-"""The maximum ratio of a pose's error to the median error in the first fit.
-
-Poses with larger errors are excluded from the first fit.
-"""
+"""A pose is excluded from the first fit if its error exceeds this multiple of the median error."""
 
 MAX_CHI_SQUARE, MEDIAN_CHI_SQUARE = 60.0, 5.348
 """The limit of the outlier test, and the median of chi-square with six degrees of freedom.
 
-A pose is an outlier if its squared deviation exceeds the limit. The squared deviations are scaled
-so that their median is the median of chi-square. The maximum was 43 in 75 simulated sets of 15
-poses without outliers. The limit is higher, because the error of an arm varies over its workspace.
+A pose is an outlier if its scaled squared deviation exceeds the limit. The scale makes the median
+of all poses equal to the median of chi-square. In 75 simulated sets of 15 poses without outliers,
+the largest scaled value was 43. The limit is higher, because the error of an arm varies over its
+workspace.
 """
 
 ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
 MIN_SCALE = 0.01
-"""The minimum ratio of the median squared deviation to the median of chi-square.
+"""The minimum scale of squared deviations in the outlier test.
 
-It applies if all poses agree except for rounding errors.
+The scale is the median squared deviation divided by the median of chi-square. The minimum has an
+effect only if all poses agree up to rounding errors.
 """
 
 MAX_READMISSIONS = 5
@@ -105,17 +104,20 @@ ADVICE = (
 )
 
 INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
-"""The initial simplex of the optimization, relative to the initial values.
+"""The three corners of the initial simplex of the optimization, relative to the initial values.
 
 The variables are the logarithms of the standard deviations of the flange's rotation and position.
 """
 
 MAX_ITERATIONS = 30
 CONVERGED_STEP = 1e-10
-"""The step of the unknowns (rad, m) below which the fit has converged."""
+"""The fit has converged if each unknown (rad or m) changes by less than this value in a step."""
 
 INITIAL_STEP = 1e-6
-"""The step of the unknowns (rad, m) below which a fit of initial values has converged."""
+"""The fit of a board pose has converged if each unknown (rad or m) changes by less than this value.
+
+The result is an initial value for the fit of all unknowns.
+"""
 
 
 class HandEyeError(FlexsheetError, ValueError):
@@ -135,7 +137,11 @@ class CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class LensRig:
-    """The lenses of the stereo camera and their poses as transforms (4, 4)."""
+    """The lenses and poses of the stereo camera.
+
+    right_from_left: transform (4, 4) from the left to the right camera's frame.
+    world_from_left: transform (4, 4) from the left camera's frame to the world.
+    """
 
     left: CameraLens
     right: CameraLens
@@ -145,7 +151,7 @@ class LensRig:
 
 @dataclass(frozen=True, slots=True)
 class CornerView:
-    """The k board corners in one image.
+    """The k board corners that were detected in one image.
 
     points_board: positions (k, 3), in m, in the board's frame.
     pixels: positions (k, 2) in the image, px.
@@ -172,10 +178,9 @@ class BoardDetection:
 class PoseResidual:
     """The residual of one pose of the arm.
 
-    shift_m, rotation_rad: difference between the flange pose from the images and the flange pose
-        from the joint angles.
-    rms_px: rms distance between the detected corners and the corners projected with the pose from
-        the joint angles.
+    shift_m, rotation_rad: difference between two flange poses, one from the images and one from the
+        joint angles.
+    rms_px: rms distance between the detected corners and the corners that the joint angles predict.
     reason: reason why the pose was excluded; empty if it was used.
     """
 
@@ -194,10 +199,10 @@ class BaseFit:
         is a rotation (rad) about the base's origin in world axes, then a translation (m). If
         `jackknife_ratio` is above 1, the covariance has been multiplied by `jackknife_ratio`
         squared.
-    corner_sigma_px: standard deviation of one coordinate of a corner.
+    corner_sigma_px: standard deviation of the error of one pixel coordinate of a corner.
     arm_sigma_rad, arm_sigma_m: standard deviations of one component of the flange's pose error.
-    jackknife_ratio: standard deviation from the jackknife divided by the standard deviation from
-        the fit, as rms over the six components.
+    jackknife_ratio: ratio of the jackknife's standard deviation to the standard deviation of the
+        fit. It is an rms over the six components of the motion.
     leave_one_out: changes (n, 6) of the base pose if each of the n poses in turn is excluded from
         the fit.
     """
@@ -215,8 +220,8 @@ class BaseFit:
     def compute_std(self, world_m: Floats) -> tuple[float, float]:
         """Return the standard deviations of the position (m) and rotation (rad) of a flange pose.
 
-        Each value combines all three axes. The pose is computed from joint angles with the fitted
-        base.
+        Only the uncertainty of the fitted base pose is considered. Each value combines all three
+        axes.
 
         world_m: position (3,) of the flange in the world.
         """
@@ -227,7 +232,7 @@ class BaseFit:
 
 @dataclass(frozen=True, slots=True)
 class _Unknowns:
-    """The current estimates of the two unknown transforms (4, 4)."""
+    """The current estimates (4, 4) of the transforms world_from_base and flange_from_board."""
 
     world_from_base: Floats
     flange_from_board: Floats
@@ -248,12 +253,12 @@ class _LinearizedPose:
     """The corners of one pose, linearized at the current estimates of the unknowns.
 
     measured: flange motion (6,), in the flange's frame, that fits the corners best.
-    spread: covariance (6, 6) of this motion for corner noise of 1 px.
-    by_unknowns: derivatives (6, 12) of the flange motion with respect to the motions of base and
-        board.
-    inner_px2: sum of squared pixel residuals after the flange motion.
+    spread: covariance (6, 6) of `measured` if the corner noise is 1 px.
+    by_unknowns: derivatives (6, 12) of the flange motion with respect to the motions of the base
+        and the board.
+    inner_px2: sum of the squared pixel residuals that remain after the flange motion `measured`.
     count: number of corner coordinates.
-    rms_px: rms error of the corners without the flange motion.
+    rms_px: rms residual of the corners before the flange motion.
     """
 
     measured: Floats
@@ -271,8 +276,8 @@ def calibrate_base(
 ) -> BaseFit:
     """Estimate the pose of the base of an arm in the world.
 
-    The stereo camera is assumed to be exact. Its errors shift the base and the fingertip equally,
-    because the same camera measures both.
+    The stereo camera is assumed to be exact. The same camera measures the base and the fingertip,
+    so errors of the camera shift both equally.
 
     detections: at least MIN_POSES poses of the arm.
     rig: stereo camera with its pose in the world.
@@ -369,8 +374,8 @@ def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
 def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
     """Fit the board's pose left_from_board (4, 4) to the corners of both images.
 
-    From one image, the pose of a flat board has two similar solutions. The other image decides
-    between them.
+    A single image of a flat board has two similar pose solutions. The second image decides between
+    them.
     """
     left = detection.left
     count, rotations, shifts, _ = cv2.solvePnPGeneric(
@@ -400,10 +405,11 @@ def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
 def _linearize_pixels(
     detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Compute the residuals of the corners, and their derivatives for a small flange motion.
+    """Compute the residuals of the corners, and the derivatives for a small flange motion.
 
-    Return the residuals (m,) of m pixel coordinates, in px, and their derivatives (m, 6) with
-    respect to rotation (rad) and translation (m).
+    Return residuals (m,), in px, of the m pixel coordinates of all corners. Also return the
+    derivatives (m, 6) of the projected coordinates with respect to rotation (rad) and translation
+    (m).
     """
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
@@ -434,7 +440,7 @@ def _linearize_pixels(
 
 
 def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig) -> _Unknowns:
-    """Return initial values of the unknown transforms.
+    """Return initial values of the unknown transforms world_from_base and flange_from_board.
 
     The closed-form solution is computed for all poses and for random subsets. The solution that
     fits all poses best is returned.
@@ -476,10 +482,10 @@ def _solve_closed_form(
     """Return Shah's closed-form solution of B F X = C, or None if the poses have no solution.
 
     Here, B is world_from_base, F is base_from_flange, X is flange_from_board and C is
-    world_from_board. If Y is the transpose of X's rotation, C Y = B F holds for the rotations of
-    each of the n poses. Therefore, the matrix sum(kron(F, C)) maps the stacked columns of Y to n
-    times the stacked columns of B. Both are first singular vectors of this matrix. The translations
-    follow by linear least squares.
+    world_from_board. The rotations of each of the n poses satisfy C Y = B F, where Y is the
+    transpose of X. Therefore, the matrix sum(kron(F, C)) maps the stacked columns of Y to n times
+    the stacked columns of B. Both vectors of stacked columns are first singular vectors of this
+    matrix, apart from scale. The translations follow by linear least squares.
     """
     worlds = [rig.world_from_left @ board for board in boards]
     stacked = np.sum(
@@ -502,7 +508,10 @@ def _solve_closed_form(
 
 
 def _unstack_rotation(stacked: Floats) -> Floats:
-    """Return the rotation (3, 3) nearest to a multiple of a matrix with stacked columns (9,)."""
+    """Return the rotation (3, 3) that is nearest to a multiple of a matrix.
+
+    stacked: columns of the matrix as one vector (9,).
+    """
     matrix = stacked.reshape(3, 3).T
     return _mean_rotation([matrix if np.linalg.det(matrix) > 0.0 else -matrix])
 
@@ -510,10 +519,9 @@ def _unstack_rotation(stacked: Floats) -> Floats:
 def _compute_discrepancies(
     unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Return the differences between the flange poses from joint angles and from images.
+    """Return the differences (n, 6) between n flange poses from joint angles and from images.
 
-    A difference (6,) is a rotation vector (rad) and a translation (m) in the frame of the flange.
-    The result has the shape (n, 6) for n poses.
+    A difference is a rotation vector (rad) and a translation (m) in the frame of the flange.
     """
     found = []
     for flange, board in zip(flanges, boards, strict=True):
@@ -524,9 +532,9 @@ def _compute_discrepancies(
 
 
 def _find_rough_inliers(discrepancies: Floats) -> Bools:
-    """Return a mask (n,) of the poses for the first fit.
+    """Return a mask (n,) that selects from n poses those for the first fit.
 
-    Poses with errors above a multiple of the median are excluded.
+    A pose is excluded if its error exceeds a multiple of the median error.
 
     discrepancies: differences (n, 6) that `_compute_discrepancies` returned.
     """
@@ -539,16 +547,17 @@ def _find_rough_inliers(discrepancies: Floats) -> Bools:
 
 @dataclass(frozen=True, slots=True)
 class _NoiseModel:
-    """The standard deviations of corner coordinates (px) and of a flange pose (rad and m)."""
+    """The standard deviations of errors of corner coordinates (px) and flange poses (rad and m)."""
 
     corner_px: float
     arm_rad: float
     arm_m: float
 
     def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
-        """Return the information matrices (n, 6, 6) of the flange motions of n poses.
+        """Return the weights (n, 6, 6) of the flange motions of n poses.
 
-        The matrices take into account the errors of the corners and of the arm.
+        A weight is the inverse of the covariance that results from the errors of the corners and of
+        the arm.
         """
         arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in poses])
@@ -556,10 +565,10 @@ class _NoiseModel:
 
 
 def _find_inliers(poses: Sequence[_LinearizedPose], model: _NoiseModel) -> Bools:
-    """Return a mask (n,) of the poses that are not outliers.
+    """Return a mask (n,) that is true for each of the n poses that is not an outlier.
 
-    The mask is the result of a chi-square test of deviations that are scaled by their median. A
-    pose with deviations as small as rounding errors is never an outlier.
+    The mask is the result of a chi-square test of deviations that are scaled by their median. If a
+    deviation is as small as rounding errors, the pose is not an outlier.
     """
     measured = np.array([one.measured for one in poses])
     bounded = _NoiseModel(
@@ -578,9 +587,10 @@ def _fit_unknowns(
     flanges: Sequence[Floats],
     rig: LensRig,
 ) -> tuple[_Unknowns, _NoiseModel]:
-    """Fit the unknown transforms and the standard deviations by Gauss-Newton steps.
+    """Fit the unknown transforms and the standard deviations of the errors by Gauss-Newton steps.
 
     unknowns: initial transforms.
+    flanges: poses base_from_flange (4, 4).
 
     Raises HandEyeError if the poses do not determine the base.
     """
@@ -639,7 +649,7 @@ def _linearize(
 def _normal_equations(
     poses: Sequence[_LinearizedPose], model: _NoiseModel
 ) -> tuple[Floats, Floats]:
-    """Return the normal equations, matrix (12, 12) and vector (12,), for a step of the unknowns."""
+    """Return the matrix (12, 12) and vector (12,) of the equations for a Gauss-Newton step."""
     weights = model.compute_weights(poses)
     slopes = np.array([one.by_unknowns for one in poses])
     measured = np.array([one.measured for one in poses])
@@ -651,10 +661,10 @@ def _normal_equations(
 def _estimate_deviations(
     poses: Sequence[_LinearizedPose], before: _NoiseModel | None
 ) -> _NoiseModel:
-    """Estimate the standard deviations of the corners and of the flange's pose.
+    """Estimate the standard deviations of the errors of corners and flange poses.
 
-    The corner noise is estimated from residuals within poses, and the flange's error by restricted
-    maximum likelihood.
+    The corner noise is estimated from the residuals that remain if each pose is fitted alone. The
+    errors of flange poses are estimated by restricted maximum likelihood.
 
     before: result of the previous iteration; None in the first iteration.
     """
@@ -696,7 +706,8 @@ def _estimate_deviations(
 def apply_motion(pose: Floats, motion: Floats) -> Floats:
     """Rotate a pose (4, 4) about the origin of the pose, and translate it.
 
-    Both parts of the motion (6,) are in the axes of the parent frame.
+    motion: rotation vector (rad) and translation (m), together (6,), in the axes of the frame to
+        which the pose refers.
     """
     rotation = rotation_from_vector(motion[:3])
     return transform(rotation @ pose[:3, :3], pose[:3, 3] + motion[3:])

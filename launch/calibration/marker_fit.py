@@ -1,14 +1,14 @@
 """Fit the marker's position on the finger to touches of known points in several orientations.
 
-The measured centre of the marker is p + e + R o + b + noise. Here, p is the touched point, and e is
-the error of its position, which all touches of this point have in common. R is the finger's
-orientation, and o is the unknown offset of the marker in the finger's frame. All touches in one
-orientation have the error b in common, because the detected centre of a tilted marker is biased. A
-touched plane, such as the sheet, only determines the component along its normal.
+The measured centre of the marker is p + e + R o + b + noise. Here, p is the assumed position of the
+touched point, and e is its error, which is the same in all touches of this point. R is the finger's
+orientation, and o is the unknown offset of the marker in the finger's frame. The error b is the
+same in all touches in one orientation. It occurs because the detected centre of a tilted marker is
+biased. A touched plane, such as the sheet, only determines the component along its normal.
 
-This is a linear model with random effects e and b. Their variances and the offset are estimated by
-restricted maximum likelihood with prior distributions. The covariance of the offset therefore
-follows from the residuals (Searle, Casella and McCulloch 1992, chapter 6).
+This is a linear model with random effects e and b. The variances of e and b and the offset o are
+estimated by restricted maximum likelihood with prior distributions. The covariance of the offset
+therefore follows from the residuals (Searle, Casella and McCulloch 1992, chapter 6).
 """
 
 from __future__ import annotations
@@ -25,41 +25,42 @@ from flexsheet.nodes.arrays import Floats
 TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M = 2e-4, 1e-4, 1e-4
 """The expected standard deviations (m) per axis of three kinds of errors.
 
-The first is the error of a single touch. The second is an error that all touches in one orientation
-have in common. The third is the error of the position of a touched point.
+The first is the error of a single touch. The second is the error that is the same in all touches in
+one orientation. The third is the error of the position of a touched point.
 """
 
 COMMON_ERROR_M = 6.5e-5
-"""The standard deviation (m) per axis of the error that all touches have in common.
+"""The standard deviation (m) per axis of the error that is the same in all touches.
 
 The residuals do not show this error. Its causes are the mean bias of the detected centre of a
-tilted marker and the stereo calibration. If this value is used, the stated error equals the true
-error in simulated laboratories with seeds 0 to 11.
+tilted marker and the stereo calibration. With this value, the error that the fit states is equal to
+the true error in simulated laboratories with seeds 0 to 11.
 """
 
 PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])
-"""The standard deviations (3,) of the logarithms of the expected standard deviations.
+"""The prior uncertainties (3,) of three standard deviations, on a logarithmic scale.
 
-They describe the prior distributions of the errors of touches, orientations and points.
+The three standard deviations are of the errors of touches, orientations and points.
 """
 
 POINT_GRID_M = 1e-6
-"""The spacing (m) of the grid to which points are rounded to find touches of the same point."""
+"""Touched points are the same if their positions are equal after rounding to this grid (m)."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)
-"""The minimum angle (rad) between two orientations that count as different."""
+"""Two orientations are different if the angle (rad) between them is at least this value."""
 
 MAX_DEVIATION_M = 5e-4
-"""The maximum standard deviation (m) of each coordinate of a valid marker position."""
+"""A fit is valid if the standard deviation (m) of each marker coordinate is at most this value."""
 
 MAX_RESIDUAL_M = 1e-3
-"""The maximum root mean square (m) of the residuals of a valid fit."""
+"""A fit is valid if the root mean square (m) of its residuals is at most this value."""
 
 MAX_CONDITION = 1e6
 """The maximum condition number of the matrix of the linear fit.
 
-If it is larger, the touches do not determine all components of the offset.
+If the condition number is larger, the touches do not determine all components of the marker's
+offset.
 """
 
 MAX_OFFSET_M = 0.05
@@ -79,7 +80,8 @@ class Touch:
 
     marker_m: measured position (3,) of the marker in the world.
     point_m: position (3,) of the touched point in the world.
-    normal: unit normal (3,) of a touched plane; None if the pad touched the point itself.
+    normal: unit normal (3,) of a touched plane; None if the finger touched a known point of an
+        object.
     world_from_finger: orientation of the finger as a rotation matrix (3, 3).
     """
 
@@ -94,9 +96,9 @@ class MarkerFit:
     """The fitted position of the marker on the finger, with its uncertainty.
 
     marker_from_pad_m: position (3,) of the marker in the finger's frame.
-    covariance_m2: covariance (3, 3) of the position.
+    covariance_m2: covariance (3, 3) of this position.
     point_offset_m: mean (3,) of the estimated errors of the touched points, in the world frame.
-    residuals_m: distance (touches,) between the measured and the fitted marker of each touch.
+    residuals_m: for each touch, distance between the measured and the fitted marker position.
     points, orientations: numbers of different points and orientations.
     """
 
@@ -114,15 +116,15 @@ class MarkerFit:
 
     @property
     def residual_rms_m(self) -> float:
-        """Return the root mean square (m) of the residual distances."""
+        """Return the root mean square (m) of `residuals_m`."""
         return float(np.sqrt(np.mean(self.residuals_m**2)))
 
 
 def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     """Fit the marker's position on the finger by restricted maximum likelihood.
 
-    Raises MarkerFitError if there are too few touches or orientations, or if touches contradict
-    each other. Raises it also if the position is implausible or not determined.
+    Raises MarkerFitError if there are too few touches or orientations, or if the touches contradict
+    each other. Also raises MarkerFitError if the touches do not determine a plausible position.
     """
     orientation = np.array(group_orientations([touch.world_from_finger for touch in touches]))
     orientations = len(set(orientation))
@@ -156,7 +158,8 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     def solve(logarithms: Floats) -> tuple[float, Floats, Floats, Floats]:
         """Return the cost, the offset (3,), its covariance (3, 3), and the weighted residuals.
 
-        logarithms: logarithms (3,) of the standard deviations relative to their expected values.
+        logarithms: logarithm (3,) of each of three standard deviations divided by its expected
+            value.
         """
         noise, turned, placed = (expected_m * np.exp(logarithms)) ** 2
         covariance = fixed + turned * same_orientation + placed * same_point
@@ -212,7 +215,7 @@ def _check_fit(fit: MarkerFit) -> None:
 
 
 def group_orientations(rotations: Sequence[Floats]) -> list[int]:
-    """Group similar orientations, and return the index of the group of each orientation.
+    """Group similar orientations, and return a group index for each orientation.
 
     rotations: rotation matrices (3, 3).
     """

@@ -1,11 +1,11 @@
 """Predict the errors of a calibrated laboratory from the uncertainties of its calibrations.
 
 The prediction is a Monte Carlo simulation. It samples apparatuses, which are sets of possible true
-parameters of the devices. Their deviations from the calibrated parameters in the scene have the
-covariances of the calibrations. Parameters that no calibration measures deviate by the standard
-deviations below. All errors of sheet, image, force and fingertip are computed from the same
-samples, so errors with a common cause are counted once. The true parameters of simulated devices
-are not used.
+parameters of the devices. The true parameters deviate at random from the calibrated parameters in
+the scene, with the covariances that the calibrations state. For a parameter that no calibration
+measures, this module defines a standard deviation. All errors of the sheet, image, force and
+fingertip are computed from the same samples, so an error with a common cause is counted once. The
+true parameters of simulated devices are not used.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ DRAW_SEED = 20_000
 PIXEL_M = 0.0025
 """The size (m) of a pixel of the predicted images.
 
-Image errors are averaged over an area of about 100 mm².
+Image errors are averages over an area of about 100 mm², so smaller pixels are not needed.
 """
 
 CELLS = 16
@@ -56,37 +56,38 @@ NORMAL_95 = 1.645
 """The 95 % quantile of the standard normal distribution."""
 
 RADIUS_STD_M = 3e-4
-"""The standard deviation (m) of the radius of a soft fingertip measured with a calliper."""
+"""The standard deviation (m) of a soft fingertip's radius that was measured with a calliper."""
 
 EYE_STD_M = 5e-3
 """The standard deviation (m) per axis of an eye position from a head tracker.
 
-It is used if no calibration has measured the eyes.
+This value is used if no calibration has measured the eyes.
 """
 
 STAMP_STD_S = 3e-3
-"""The standard deviation (s) of exposure time minus timestamp.
+"""The standard deviation (s) of the difference between exposure time and timestamp.
 
-It is used if no calibration has measured the offset. The value assumes a uniform distribution
+This value is used if no calibration has measured the difference. It assumes a uniform distribution
 within an exposure of 10 ms.
 """
 
 THICKNESS_GRADIENT_STD, SHEET_MASS_STD_RATIO = 0.03, 0.07
-"""The standard deviations of the sheet's thickness gradient and of its relative mass per area.
+"""The standard deviations of the sheet's relative thickness gradient and relative mass per area.
 
-The second value is used if the mass per area was not measured. It combines 4 % for the density and
-6 % for the thickness. Sources: ISO 3302-1 class M1 for rubber sheets; densities of natural rubber
-compounds.
+The second value is used if the mass per area was not measured. It combines deviations of 4 % of the
+density and 6 % of the thickness. Sources: ISO 3302-1 class M1 for rubber sheets; densities of
+natural rubber compounds.
 """
 
 FRICTION, FRICTION_STD_LN = 1.24, 0.3
-"""The friction coefficient between rubber and a finger at 1 N, and the deviation of its logarithm.
+"""The friction coefficient between rubber and a finger at 1 N, and its uncertainty.
 
-The second value is the standard deviation of the natural logarithm. Source: Seo et al. 2009.
+The second value is the standard deviation of the coefficient's natural logarithm. Source: Seo et
+al. 2009.
 """
 
 CREEP_RATIO_PER_DECADE, CREEP_STD = 0.05, 0.02
-"""The relative decrease of the force of natural rubber per decade of time, and its deviation.
+"""The relative decrease of the force of natural rubber per decade of time, and its uncertainty.
 
 The second value is the standard deviation of the first value.
 """
@@ -96,8 +97,8 @@ MAX_HYSTERESIS_RATIO = 0.9
 IMAGE_MODEL_STD_M = 6e-5
 """The rms image error (m) that remains if all calibrated parameters are exact.
 
-It is caused by the lens of the projector and the calculated shape of the sheet. The value is from
-simulated laboratories with seeds 0 to 11.
+The lens of the projector and the calculated shape of the sheet cause this error. The value was
+measured in simulated laboratories with seeds 0 to 11.
 """
 
 
@@ -117,14 +118,14 @@ class PredictedError(LimitedModel):
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """The results of calibrations, for the prediction of errors.
+    """The results of calibrations from which errors are predicted.
 
     calibrations: calibrations that the nodes use.
-    edges: covariance (19, 19) of the unknowns of `fit_edges`, by side. A side that is not
-        calibrated is absent.
+    edges: covariance (19, 19) of the unknowns of `fit_edges`, by side. If an arm is not calibrated,
+        its side is absent.
     projector_px2: covariance (2, 2) of the displacement of the projected image.
     eyes_m2: covariance (3, 3) of the midpoint between the eyes.
-    stamp_std_s: standard deviation of exposure time minus timestamp.
+    stamp_std_s: standard deviation of the difference between exposure time and timestamp.
     sheet_mass_std_ratio: relative standard deviation of the sheet's mass per area.
     """
 
@@ -138,12 +139,13 @@ class Knowledge:
 
 
 def predict_errors(known: Knowledge, tracking_m: float) -> dict[Metric, PredictedError]:
-    """Predict the errors of sheet and fingertip during a stroke, and of image and force at rest.
+    """Predict the errors of a calibrated laboratory.
 
-    The finger moves at the working speed of the scene.
+    The errors of sheet and fingertip apply to a stroke of the finger at the working speed of the
+    scene. The errors of image and force apply to a finger at rest.
 
     tracking_m: mean tracking error of the sheet that the devices report during a stroke. It is
-        independent of the calibration errors, so it is added to them in quadrature.
+        independent of the calibration errors. Therefore, the squares of both errors are added.
     """
     random = np.random.default_rng(DRAW_SEED)
     scene = known.scene
@@ -239,10 +241,10 @@ def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
 def draw_camera_errors(
     scene: Scene, calibration: StereoCalibration, random: Random
 ) -> dict[str, Floats]:
-    """Return random errors (3,), in m, of the measured positions of the clamps, by side.
+    """Return a random error (3,), in m, of the measured position of each clamp, by side.
 
-    The errors are relative to the finger, because an error that clamps and finger have in common
-    displaces both equally.
+    The error is relative to the measured position of the finger. If an error displaces clamp and
+    finger equally, it has no effect.
     """
     left, right, stand = calibration.left, calibration.right, calibration.right_from_left
     rig = np.zeros(22)
@@ -265,7 +267,7 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 
     arm: parameters without errors.
     covariance: covariance (19, 19) from `fit_edges`. If it is None, the arm is returned unchanged.
-    seen_m: error (3,) of the measured position of the arm's clamp.
+    seen_m: error (3,) of the position of the arm's clamp that the camera measured.
     """
     if covariance is None:
         return arm
@@ -286,8 +288,8 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
     """Return a random modulus and a random unstretched width of the sheet.
 
-    The result contains the fields `modulus_ratio` and `slack_width_offset_m`. It is empty if there
-    is no sheet calibration.
+    The result has the keys `modulus_ratio` and `slack_width_offset_m`. If there is no sheet
+    calibration, the result is empty.
     """
     sheet = known.calibrations.sheet
     if sheet is None:
@@ -304,7 +306,8 @@ def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Rando
     """Return the apparatus with a random hysteresis that is consistent with the calibration.
 
     The calibration measures how much smaller the force is during unloading than during loading at
-    the same depth. Creep causes a part of this difference, and the hysteresis causes the remainder.
+    the same depth. Creep causes a part of this difference. The hysteresis is chosen to cause the
+    remainder.
     """
     if sheet.hysteresis_ratio is None:
         return apparatus
@@ -341,9 +344,9 @@ def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[
 
 
 def _draw(covariance: Floats, random: Random) -> Floats:
-    """Return a random vector with a normal distribution of mean 0.
+    """Return a random vector from a normal distribution with mean 0 and the given covariance.
 
-    The covariance may be singular.
+    The covariance can be singular.
     """
     values, vectors = np.linalg.eigh(covariance)
     scales = np.sqrt(np.maximum(values, 0.0))

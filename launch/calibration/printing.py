@@ -1,7 +1,7 @@
 """Write calibration boards as SVG or PNG files, to be printed at true size.
 
-The first square is black. The white squares of a ChArUco board contain the markers, numbered by row
-as OpenCV's detector expects.
+The first square is black. The white squares of a ChArUco board contain the markers. As OpenCV's
+detector requires, the marker numbers increase row by row.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PNG_DOTS_PER_INCH = 300
 
 
 def find_black_rectangles(board: Board) -> Floats:
-    """Return the black rectangles (n, 4) of a board as x, y, width and height, in m.
+    """Return the n black rectangles of a board as an array (n, 4) of x, y, width and height, in m.
 
     The origin is the outer corner of the first square. Raises CalibrationError if the markers do
     not fit the board.
@@ -57,7 +57,7 @@ def find_black_rectangles(board: Board) -> Floats:
 
 
 def _find_runs(black: Bools) -> list[tuple[int, int, int]]:
-    """Return each horizontal run of black cells in a marker image as (row, first column, length).
+    """Return (row, first column, length) for each horizontal run of black cells in a marker image.
 
     black: marker image (rows, columns); true for black cells.
     """
@@ -69,7 +69,10 @@ def _find_runs(black: Bools) -> list[tuple[int, int, int]]:
 
 
 def make_caption(board: Board) -> str:
-    """Return the text below the board. The text describes the board and the print scale."""
+    """Return the text that is printed below the board.
+
+    The text describes the board and the print scale.
+    """
     text = f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"
     if board.marker_m is not None:
         text += f", markers of {1e3 * board.marker_m:g} mm, {board.dictionary}"
@@ -104,7 +107,7 @@ def make_svg(board: Board) -> str:
 
 
 def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
-    """Return the board as an image (h, w) with 0 for black and 255 for white.
+    """Return the board as a grey image, which is 0 at black and 255 at white pixels.
 
     A pixel is black if its centre is inside a black rectangle.
     """
@@ -120,7 +123,7 @@ def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
 
 
 def write_board(board: Board, path: Path) -> None:
-    """Write the board to a file, in the format of the file's suffix.
+    """Write the board to a file, in the format that the suffix of the file name states.
 
     Raises CalibrationError if the suffix is unknown or the board is unsuitable.
     """

@@ -1,7 +1,8 @@
 """Calibrate the optics and the pose of the projector from points that its pixels light.
 
-A projector is an inverse camera: each of its pixels lights a point. Two cameras measure the
-position of this point. Therefore, the poses of the sheet on which the points lie need not be known.
+A projector is an inverse camera, because each of its pixels lights a point. The points are on the
+sheet, and the two cameras of the stereo camera measure their positions. Therefore, the poses of the
+sheet need not be known.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from flexsheet.nodes.models.rigid import (
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
-"""The distance (px) between neighbouring projector pixels that are measured."""
+"""The distance (px) in the projector image between neighbouring pixels that are measured."""
 
 MIN_POSES, MIN_POINTS = 3, 200
 MIN_DEPTH_RANGE_M = 0.03
@@ -41,10 +42,10 @@ MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 OUTLIER_RATIO = 4.0
 TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""The typical errors (9,) of a projector in a scene that was measured by tape.
+"""The typical errors (9,) of a projector whose pose in the scene was measured with a tape.
 
-They are the rotation (rad), position (m), focal length (relative) and principal point (px). Only
-their ratios matter.
+The errors are of the rotation (rad), position (m), focal length (relative) and principal point
+(px). Only their ratios matter.
 """
 
 
@@ -60,9 +61,9 @@ class ProjectorError(FlexsheetError, ValueError):
 class ProjectorPoints:
     """The points that projector pixels light, measured by two cameras.
 
-    world: positions (n, 3) in the world, m.
-    pixels: projector pixels (n, 2).
-    pose: index (n,) of the sheet's pose.
+    world: positions (n, 3) of the n points in the world, m.
+    pixels: projector pixel (n, 2) that lights each point.
+    pose: index (n,) of the sheet's pose in which each point was measured.
     """
 
     world: Floats
@@ -72,13 +73,14 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """A calibrated projector, with its residuals in projector pixels and in metres on the sheet.
+    """A calibrated projector, with residuals in projector pixels and in metres on the sheet.
 
-    held_out_rms_px: rms residual of the sheet poses that were excluded from the fit.
+    held_out_rms_px: rms residual from cross-validation. Each sheet pose is compared with a fit to
+        all other poses.
     before_rms_px: rms residual of the initial projector.
-    coverage_ratio: fraction of the image's cells that contain points.
-    shift_covariance_px2: covariance (2, 2) of the mean displacement of the image. It is computed
-        from fits that each omit one pose (delete-one jackknife).
+    coverage_ratio: fraction of the projected image that contains points.
+    shift_covariance_px2: covariance (2, 2) of the mean displacement of the image. The jackknife
+        computes it from fits that each omit one sheet pose.
     """
 
     projector: Projector
@@ -101,9 +103,9 @@ def measure_points(
 ) -> ProjectorPoints:
     """Triangulate the points that projector pixels light, from images of each sheet pose.
 
-    poses: images of the Gray-code patterns from the left and from the right camera, for each pose.
+    poses: for each pose, the images of the Gray-code patterns from the left and the right camera.
     camera: stereo camera with calibrated optics and with `world_from_left` from the scene.
-    projector: projector; only its image size is used.
+    projector: projector, of which only the image size is used.
 
     Raises ProjectorError if the patterns cannot be decoded.
     """
@@ -125,9 +127,10 @@ def measure_points(
 
 
 def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> Floats:
-    """Triangulate pixels (n, 2) of the left and the right image.
+    """Triangulate n points from their pixels (n, 2) in the left and the right image.
 
-    Return the world points (n, 3), in m, midway between the rays of the two cameras.
+    Return the points (n, 3) in the world, in m. Each point is midway between the rays of the two
+    cameras.
     """
     from_right = inverse(camera.right_from_left)
     slopes = [
@@ -160,10 +163,10 @@ def project_points(projector: Projector, world: Floats) -> Floats:
 def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
     """Fit the optics and the pose of a projector to the points that its pixels light.
 
-    guess: initial projector of the fit.
+    guess: initial values of the projector.
 
-    Raises ProjectorError if there are too few points or poses, or if their depth range or coverage
-    is too small. Raises it also if the residuals are too large.
+    Raises ProjectorError if there are too few points or poses, or if the points cover too little of
+    the image or of the depth range. Also raises ProjectorError if the residuals are too large.
     """
     inliers = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _measure_depth_range(points, guess)
@@ -232,7 +235,10 @@ def _rms(values: Floats) -> float:
 
 
 def _measure_depth_range(points: ProjectorPoints, guess: Projector) -> float:
-    """Return the depth range (m) of the central 90 % of the points along the projector's axis."""
+    """Return the depth range (m) of the central 90 % of the points.
+
+    The depth is measured along the projector's axis.
+    """
     pose = guess.world_from_projector
     along = apply(inverse(pose_matrix(pose)), points.world)[:, 2]
     return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
@@ -245,13 +251,15 @@ def _measure_coverage(pixels: Floats, projector: Projector) -> float:
 
 
 def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) -> Projector:
-    """Fit the pose, one focal length, the principal point, k1, k2, p1 and p2 by least squares.
+    """Fit a projector's pose, focal length, principal point and distortion by least squares.
 
-    The aspect ratio and k3 are fixed to the values of `guess`. If a projector has lens shift, its
-    principal point is outside the image. OpenCV's fit rejects such a point and is therefore not
-    used.
+    The fitted distortion coefficients are k1, k2, p1 and p2.
 
-    inliers: mask (n,) of the points to use.
+    The aspect ratio and k3 are fixed to the values of `guess`. OpenCV's fit is not used, because it
+    rejects a principal point outside the image. If a projector has lens shift, its principal point
+    is outside the image.
+
+    inliers: mask (n,) that is true for each of the n points to use.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
@@ -272,10 +280,10 @@ def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) ->
         return np.asarray((projected.reshape(-1, 2) - pixels).ravel())
 
     def derivatives(x: Floats) -> Floats:
-        """Return the derivatives (2n, 13) of the residuals with respect to the unknowns.
+        """Return the derivatives (2n, 13) of the residuals of n points with respect to 13 unknowns.
 
-        The unknowns are rotation (3), translation (3), focal length, principal point (2), and k1,
-        k2, p1, p2.
+        The unknowns are rotation (3), translation (3), focal length, principal point (2), and the
+        distortion coefficients k1, k2, p1 and p2.
         """
         _, by = cv2.projectPoints(world, x[:3], x[3:6], *split(x))
         focal = by[:, 6:7] + aspect * by[:, 7:8]
@@ -314,12 +322,12 @@ def fit_keystone(
     """Fit a projector to the pixels that light the corners of a rectangle on the imaginary screen.
 
     Many projectors light four given corners exactly, because the corners determine only a
-    homography. Of these projectors, the result is the projector that is nearest to `guess`. Its
-    lens distortion is equal to the distortion of `guess`.
+    homography. The result is the projector whose parameters are nearest to `guess`, with the same
+    lens distortion as `guess`.
 
-    corners_px: projector pixels (4, 2) of bottom left, bottom right, top right, top left, as the
-        user sees them.
-    half_width_m, half_height_m: half the size of the rectangle.
+    corners_px: projector pixels (4, 2) of the corners bottom left, bottom right, top right and top
+        left, as the user sees them.
+    half_width_m, half_height_m: half the width and half the height of the rectangle.
 
     Raises ProjectorError if the corners are not a convex quadrangle, or if no projector fits them.
     """

@@ -1,7 +1,7 @@
 """Write a report of a stereo calibration as an HTML page.
 
-The report shows corner residuals, the quality of the pairs, the coverage and the uncertainty. The
-page is self-contained, and its images are also written as PNG files.
+The report shows the corner residuals, the quality of each image pair, the coverage of the images
+and the uncertainty. The page contains its images, which are also written as PNG files.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""The length (px of the image) of an arrow that shows the 95 % quantile of the residuals."""
+"""The length (px of the camera image) of an arrow for a residual at the 95 % quantile."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
@@ -43,8 +43,9 @@ img { max-width: 100%; } figcaption { color: #444; }
 def compute_epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
     """Compute the distance between each corner in the right image and its epipolar line.
 
-    Return the right pixels (n, 2) of all common corners, and their signed distances (n,), in px.
-    The distances are measured in undistorted coordinates of the right camera.
+    Return the pixels (n, 2) of the n corners in the right image, and the signed distances (n,), in
+    px. Only corners that both images show are included. The distances are measured in undistorted
+    coordinates of the right camera.
     """
     rig = StereoRig.from_fit(calibrated.fit.rig)
     rotation, position = rig.right_from_left[:3, :3], rig.right_from_left[:3, 3]

@@ -1,8 +1,8 @@
 """Select reliable image pairs and corners, and fit the stereo rig to them.
 
 Each camera is first fitted alone by Zhang's method (A flexible new technique for camera
-calibration, 2000). Then both cameras are fitted together with all parameters free (`bundle`). This
-predicts unused images more accurately than a fit with fixed intrinsics.
+calibration, 2000). Then the parameters of both cameras are fitted together (module `bundle`). The
+result predicts unused images more accurately than a fit in which the lens parameters are fixed.
 """
 
 from __future__ import annotations
@@ -41,17 +41,14 @@ CORNER_RATIO = 6.0
 
 CORNER_ROUNDS = 2
 MAX_OUTLIER_FRACTION = 0.15
-"""The maximum fraction of outliers among the corners of a pair.
-
-Pairs with a larger fraction are not used.
-"""
+"""An image pair is not used if a larger fraction of its corners are outliers."""
 
 REPEAT_PX = 1.0
-"""The maximum median distance (px) of corners between two pairs that have the same board pose."""
+"""Two image pairs show the same board pose if the corners' median displacement (px) is smaller."""
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
-    """Fit the lens parameters (8,) of one camera to its images of the board.
+    """Fit the lens parameters (8,), as for `lens_arrays`, of one camera to its images of the board.
 
     points: corners of the board (n, 3), m.
     size: width and height of the images, px.
@@ -72,14 +69,14 @@ def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) 
 def compute_misfits(
     pairs: Sequence[BoardPair], points: Floats, left: Floats, right: Floats
 ) -> tuple[Floats, Floats]:
-    """Compute how much each image pair deviates from a reference pair, to find wrong pairs.
+    """Compute how much each of n image pairs deviates from a reference pair, to find wrong pairs.
 
     Each pair alone determines the relative pose of the cameras. The reference is the pair whose
-    relative pose has the smallest median deviation over all pairs (least median of squares,
+    relative pose has the smallest median deviation from all pairs (least median of squares,
     Rousseeuw 1984). Unlike a fit to all pairs, the reference is not affected by wrong pairs.
 
-    Return the deviations (n,), rms px in the right image, and the relative pose right_from_left
-    (6,) of the reference.
+    Return the rms deviations (n,), in px of the right image. Also return the pose right_from_left
+    (6,) of the reference: a rotation vector (rad) and a translation (m).
 
     points: corners of the board (n, 3), m.
     left, right: lens parameters (8,).
@@ -101,9 +98,9 @@ def compute_misfits(
 
 
 def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> RigFit:
-    """Fit both cameras together.
+    """Fit the stereo rig to the corners of all image pairs.
 
-    The initial values are from fits to each single camera and each single pair.
+    The initial values come from fits to each single camera and to each single pair.
 
     points: corners of the board (n, 3), m.
     size: width and height of the images, px.
@@ -124,7 +121,8 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
     """Return the image pairs after removing their outlier corners.
 
     The standard deviation of the residuals is estimated from their median, because outliers hardly
-    affect it. For a two-dimensional normal distribution, the median is 1.1774 standard deviations.
+    affect the median. The median length of normally distributed residuals in two dimensions is
+    1.1774 standard deviations.
     """
     distances = [[np.linalg.norm(view, axis=1) for view in views] for views in fit.residuals]
     every = np.concatenate([view for views in distances for view in views])
@@ -143,10 +141,11 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
 def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
     """Find the pairs that repeat the board pose of an earlier pair.
 
-    Return a mapping from the index of the repeated pair to the index of the earlier pair. Repeated
-    pairs have the same errors, so they must not count as independent measurements.
+    Return a mapping from the index of the repeated pair to the index of the earlier pair. A
+    repeated pair has the same errors as the earlier pair, so it must not count as an independent
+    measurement.
 
-    found: corners of each pair, or the reason why there are none.
+    found: corners of each pair, or the reason why no corners were found.
     """
     unique: dict[int, BoardPair] = {}
     repeated: dict[int, int] = {}
@@ -168,13 +167,13 @@ def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
 
 
 class PairSelection:
-    """The image pairs that are used in a calibration, and the reasons for the excluded pairs.
+    """The image pairs that are used in a calibration, and the reasons why others are excluded.
 
-    found: corners of each pair, or the reason why there are none.
+    found: corners of each pair, or the reason why no corners were found.
     good: corners of each used pair, by index.
     reasons: reason for each excluded pair, by index.
-    residuals: rms residual (2,), in px, of the left and the right image, by index. The residuals of
-        excluded pairs are included.
+    residuals: for each used or excluded pair, by index, rms residual (2,), in px, of the left and
+        the right image.
     """
 
     def __init__(self, found: Sequence[BoardPair | str], names: Sequence[str]) -> None:
@@ -188,7 +187,7 @@ class PairSelection:
             del self.good[i]
 
     def pairs(self) -> list[BoardPair]:
-        """Return the used pairs. Raises CalibrationError if there are fewer than MIN_PAIRS."""
+        """Return the used pairs. Raises CalibrationError if fewer than MIN_PAIRS pairs are used."""
         if len(self.good) < MIN_PAIRS:
             listed = "".join(f"\n  {self._names[i]}: {text}" for i, text in self.reasons.items())
             raise CalibrationError(
@@ -200,10 +199,10 @@ class PairSelection:
     def exclude_pairs(self, errors_px: Floats, ratio: float, min_px: float, what: str) -> bool:
         """Exclude pairs with large errors, and return whether any pair was excluded.
 
-        The limit is the larger of `min_px` and `ratio` times the median error.
+        An error is large if it exceeds both `min_px` and `ratio` times the median error.
 
-        errors_px: errors (n,) of the used pairs.
-        what: description of the error, for the reason.
+        errors_px: errors (n,) of the n used pairs.
+        what: description of the error, which becomes part of the reason.
         """
         limit_px = max(ratio * float(np.median(errors_px)), min_px)
         bad = [
@@ -230,7 +229,7 @@ class PairSelection:
                 self.good[i] = pair
 
     def stray_corners(self, number: int) -> int:
-        """Return the number of corners that were removed from a used pair as outliers.
+        """Return the number of outlier corners that were removed from a used pair.
 
         number: index of the pair.
         """
@@ -244,8 +243,8 @@ def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int
     """Exclude unreliable pairs and corners, and fit the stereo rig to the remaining ones.
 
     Pairs are excluded if they contradict the other pairs (`compute_misfits`) or have large
-    residuals. A pair's residual is large if it exceeds half a pixel and three times the median.
-    Corners are excluded if their residuals exceed six standard deviations.
+    residuals. A pair's residual is large if it exceeds both half a pixel and three times the
+    median. Corners are excluded if their residuals exceed six standard deviations.
 
     points: corners of the board (n, 3), m.
     size: width and height of the images, px.

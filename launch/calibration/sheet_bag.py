@@ -19,33 +19,32 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""The time (s) before and after a measured force, and the maximum depth change (m) in this time.
+"""The time (s) before and after a force measurement, and the maximum depth change (m) in this time.
 
 Force gauges lag, so forces that were measured during a motion are not used.
 """
 
 MAX_GAP_S = 0.05
-"""The maximum time (s) between a force and the nearest messages of fingertip and arms."""
+"""The maximum time (s) between a measured force and the nearest fingertip and arm messages."""
 
 MIN_DEPTH_M = 0.003
 """The minimum depth (m) of a push.
 
-At smaller depths, the error of the fingertip's position dominates the force.
+At smaller depths, errors of the fingertip's position change the expected force too much.
 """
 
 REVERSAL_M = 0.001
-"""The minimum change of depth (m) after which a motion counts as loading or unloading."""
+"""The push changes between loading and unloading if the depth reverses by more than this (m)."""
 
 MAX_ROWS = 300
 
 
 def read_pushes(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
-    """Return the scene in a bag, and the pushes during which the finger rested in the sheet.
+    """Return the scene in a bag, and the pushes in which the finger was at rest.
 
     The pushes are computed from the measured fingertip positions and arm poses.
 
-    Raises SheetModelFitError if the bag contains no scene, or no push with a valid force on the
-    sheet.
+    Raises SheetModelFitError if the bag contains no scene, or if it contains no valid push.
     """
     scene: Scene | None = None
     tips: list[tuple[int, Floats]] = []
@@ -100,11 +99,13 @@ def select_pushes(
     left: SampledMotion,
     right: SampledMotion,
 ) -> list[MeasuredPush]:
-    """Return a push for each force that was measured while the resting finger pushed the sheet.
+    """Return a push for each force that was measured while the finger was at rest in the sheet.
+
+    If there are more than MAX_ROWS pushes, MAX_ROWS of them are selected evenly.
 
     forces: (time in ns, force in N) of each measurement.
     tips: positions (3,) of the fingertip.
-    left, right: flange poses of the arms, as rows (16,).
+    left, right: flange poses of the arms. A pose is a matrix (4, 4), flattened to (16,).
     """
     clamps = [pose_matrix(arm.flange_from_edge) for arm in (scene.arms.left, scene.arms.right)]
     half_height_m = 0.5 * scene.sheet.height_m
@@ -152,7 +153,7 @@ def _gap_s(motion: SampledMotion, at_ns: int) -> float:
 
 
 def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[float, float], float]:
-    """Return depth and position (x, y) of a fingertip, and the distance between the edges, in m.
+    """Return the depth and position (x, y) of a fingertip, and the distance of the edges, in m.
 
     The depth is the distance of the fingertip behind the flat sheet between the edges. The position
     is relative to the sheet's centre.

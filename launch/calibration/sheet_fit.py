@@ -28,21 +28,22 @@ EDGE_NOISE_N = 0.1
 MODEL_ERROR_RATIO = 0.03
 """The assumed error of the force model, as a fraction of the force.
 
-Residuals are divided by the standard deviation that results from this error and the noise together.
+Each residual of the fit is divided by a standard deviation, which combines this error and the
+measurement noise.
 """
 
 OUTLIER_SIGMAS = 5.0
 """The residual, in standard deviations, above which a push is an outlier.
 
-The fit is repeated with the outliers omitted.
+The fit is repeated without the outliers.
 """
 
 MAX_RMS_SIGMAS = 1.0
-"""The maximum rms residual of a valid fit, divided by the assumed standard deviation.
+"""The maximum rms residual of a valid fit, in units of the assumed standard deviation.
 
-If it is exceeded, noise and model error are larger than assumed, and the predicted force error is
-too small. A limit for relative residuals is not useful, because noise dominates small forces, which
-a user does not feel.
+If the rms residual is larger, the noise and the model error are larger than assumed, and the
+predicted force error is too small. Residuals relative to the force are not limited, because they
+are large for small forces, which a user does not feel.
 """
 
 MAX_RELATIVE_DEVIATION = 0.5
@@ -81,15 +82,16 @@ class MeasuredPush:
 class SheetModelFit:
     """A fitted force model of the sheet, with its uncertainty.
 
-    law: force model. Its stretch ratio is relative to the nominal width.
-    names, values, standard_deviations: fitted parameters.
-    used: mask (n,) of the pushes that are not outliers.
+    law: fitted force model, whose stretch ratios refer to the nominal width of the sheet.
+    names, values, standard_deviations: names, values and standard deviations of the fitted
+        parameters.
+    used: mask (n,) that is true for each of the n pushes that is not an outlier.
     residual_ratio: measured force divided by fitted force, minus one (n,).
-    rms_ratio, worst_ratio: rms and maximum of `residual_ratio` for used pushes with forces above
-        the noise.
+    rms_ratio, worst_ratio: rms and largest magnitude of `residual_ratio`. Outliers and pushes whose
+        forces are similar to the noise are not included.
     rms_sigmas: rms of the residuals divided by their assumed standard deviations. It is computed
-        for contact forces and for edge forces, and the larger value is used. Outliers count as
-        OUTLIER_SIGMAS.
+        for contact forces and for edge forces, and the larger value is used. The residual of an
+        outlier is limited to OUTLIER_SIGMAS.
     """
 
     law: ScaledSheetModel
@@ -105,12 +107,16 @@ class SheetModelFit:
 
 
 MIN_HYSTERESIS_ROWS = 3
-"""The minimum number of pushes, for each of loading and unloading, to estimate the hysteresis."""
+"""The hysteresis is estimated only if loading and unloading each have this number of pushes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hysteresis:
-    """The fraction of the loading energy that is lost in a cycle, and its standard deviation."""
+    """A fitted hysteresis of the sheet.
+
+    ratio: fraction of the loading energy that is lost in a cycle of loading and unloading.
+    standard_deviation: standard deviation of `ratio`.
+    """
 
     ratio: float
     standard_deviation: float
@@ -119,7 +125,8 @@ class Hysteresis:
     def amplitude(self) -> float:
         """Return the relative amplitude h of the hysteresis.
 
-        The force is 1 + h times the elastic force during loading, and 1 - h times during unloading.
+        During loading, the force is 1 + h times the elastic force. During unloading, it is 1 - h
+        times the elastic force.
         """
         return self.ratio / (2.0 - self.ratio)
 
@@ -127,8 +134,8 @@ class Hysteresis:
 def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> Hysteresis | None:
     """Estimate the hysteresis from the measured forces during loading and unloading.
 
-    Return None if loading or unloading has fewer than MIN_HYSTERESIS_ROWS used pushes. Raises
-    SheetModelFitError if the force is larger during unloading than during loading.
+    Return None if fewer than MIN_HYSTERESIS_ROWS pushes can be used for loading or for unloading.
+    Raises SheetModelFitError if the force is larger during unloading than during loading.
     """
     elastic_n, _ = _predict(fit.law, pushes, fit.nominal_width_m)
     ratios = np.array([push.force_n for push in pushes]) / np.maximum(elastic_n, 1e-6)
@@ -155,7 +162,7 @@ def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> H
 
 
 def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) -> list[MeasuredPush]:
-    """Remove the effect of hysteresis from the forces of pushes."""
+    """Return the pushes after removing the effect of hysteresis from their forces."""
     signs = {None: 0.0, False: 1.0, True: -1.0}
     return [
         replace(push, force_n=push.force_n / (1.0 + signs[push.unloading] * hysteresis.amplitude))
@@ -167,7 +174,7 @@ NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ra
 
 
 PRIOR_WIDTH_M, PRIOR_LOG_CUBIC = 0.0005, 0.2
-"""The standard deviations of the prior distributions of two parameters.
+"""The standard deviations of the prior distributions of two fitted parameters.
 
 The first parameter is the unstretched width (m), which is measured with a ruler. The second is the
 logarithm of the cubic ratio, which is 1 for ideal rubber.
@@ -185,13 +192,13 @@ def fit_sheet_model(
 
     The parameters are the product of modulus and thickness, the unstretched width, and the cubic
     ratio. The cubic ratio is the cubic term of the force divided by the cubic term of ideal rubber.
-    The weight of the Mooney term is optional. The least-squares fit is robust: it first uses a
-    soft-L1 loss, and then omits outliers.
+    The weight of the Mooney term is a further, optional parameter. The least-squares fit is robust:
+    it first uses a soft-L1 loss, and then omits outliers.
 
     nominal: initial rubber of the fit.
     with_mooney: whether the weight of the Mooney term is fitted.
-    with_prior: whether nominal width and ideal rubber are used as prior values. If all pushes have
-        almost the same stretch, they do not determine the width, and these prior values are needed.
+    with_prior: whether the nominal width and ideal rubber are used as prior values. If all pushes
+        have almost the same stretch, the prior values are needed to determine the width.
 
     Raises SheetModelFitError if there are too few pushes, or if they do not determine a parameter.
     """
@@ -306,9 +313,10 @@ def _predict(
 
 
 def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
-    """Return the residuals (2, n) of contact and edge forces, divided by their standard deviations.
+    """Return the residuals (2, n) of the contact forces and the edge forces of n pushes.
 
-    The residual of an edge force that was not measured is NaN.
+    Each residual is divided by its assumed standard deviation. If an edge force was not measured,
+    the residual is NaN.
 
     width_m: nominal width of the sheet, to which stretch ratios refer.
     """
@@ -326,7 +334,7 @@ def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: fl
 
 
 def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
-    """Return measured force divided by modelled force, minus one (n,), for n pushes."""
+    """Return the measured force divided by the modelled force, minus one (n,), for n pushes."""
     forces, _ = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
     ratios: Floats = measured / np.maximum(forces, 1e-6) - 1.0
@@ -339,10 +347,10 @@ def tabulate_pushes(
     """Make a table of the ratio of measured to modelled force, from the used pushes.
 
     The axes of the table are stretch, depth, and the distances of the push from the sheet's centre
-    along x and y. Pushes must exist at every combination of stretch, x and y. Their depths can
-    differ. The ratios are interpolated at depths that all combinations cover.
+    along x and y. Pushes must exist at every combination of stretch, x and y. The depths can differ
+    between combinations. The ratios are interpolated at depths that all combinations cover.
 
-    used: mask (n,) of the pushes to use.
+    used: mask (n,) that is true for each of the n pushes to use.
 
     Raises SheetModelFitError if a combination is missing.
     """
@@ -363,14 +371,15 @@ def tabulate_pushes(
     if not cells or missing:
         where = f" at stretch, x, y {missing[0]}" if missing else ""
         raise SheetModelFitError(
-            f"there are no usable rows{where}; a table requires all combinations of stretch and "
+            f"there are no usable rows{where}; measure pushes at all combinations of stretch and "
             "position"
         )
     shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
     deepest = min(max(depth for depth, _ in rows) for rows in cells.values())
     if not shallowest < deepest:
         raise SheetModelFitError(
-            "the stretches and positions have no common depth range, which a table requires"
+            "the stretches and positions have no common depth range; measure pushes at the same "
+            "depths for all stretches and positions"
         )
     count = min(len({depth for depth, _ in rows}) for rows in cells.values())
     depths = np.geomspace(shallowest, deepest, max(2, min(count, 12)))

@@ -22,10 +22,13 @@ OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
-"""The maximum number of problems of a file that are listed; further problems are only counted."""
+"""The maximum number of problems in a file that are listed.
+
+Further problems are only counted.
+"""
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
-"""The maximum plausible ratio of a length to the sheet's width, by column of the file.
+"""The maximum plausible ratio of a length to the sheet's width, by column of the CSV file.
 
 A larger length is probably in another unit.
 """
@@ -37,10 +40,10 @@ def read_rows(
     """Read measured pushes from a CSV file, and return them with their line numbers.
 
     The first line contains the names of the columns. The columns `depth_mm` and `force_n` are
-    required, and either `edge_distance_mm` or `stretch_ratio` (edge distance divided by the scene's
-    sheet width). The columns `x_mm` and `y_mm` (relative to the sheet's centre), `edge_force_n`,
-    `finger_radius_mm` and `unloading` (1 if the finger was deeper before, else 0) are optional.
-    Empty lines and lines that start with # are skipped.
+    required. One of the columns `edge_distance_mm` and `stretch_ratio` (edge distance divided by
+    the scene's sheet width) is also required. The columns `x_mm` and `y_mm` (relative to the
+    sheet's centre), `edge_force_n`, `finger_radius_mm` and `unloading` (1 if the finger was deeper
+    before, else 0) are optional. Empty lines and lines that start with # are skipped.
 
     finger_radius_m: radius that is used if the file has no column `finger_radius_mm`.
 
@@ -79,9 +82,9 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 def _parse_row(
     where: str, cells: Mapping[str, str], sheet: SheetSpec, problems: list[Problem]
 ) -> dict[str, float]:
-    """Convert a row of the CSV file to numbers, by column.
+    """Convert the values in a row of the CSV file to numbers.
 
-    Errors in the row are appended to `problems`.
+    Return the numbers by column. Errors in the row are appended to `problems`.
 
     where: location of the row, as FILE:LINE.
     """
@@ -148,9 +151,9 @@ def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: floa
 SIMULATED_DEPTHS_M = (0.002, 0.004, 0.007, 0.012, 0.020, 0.030, 0.040, 0.050)
 SIMULATED_STRETCHES = 4
 SIMULATED_XS, SIMULATED_YS = (0.0, 0.13, 0.25), (0.0, 0.19, 0.36)
-"""The simulated contact points relative to the sheet's centre.
+"""The simulated contact points, as fractions of the sheet's width (x) and height (y).
 
-They are given as fractions of the sheet's width (x) and height (y).
+The positions are relative to the sheet's centre.
 """
 
 
@@ -165,15 +168,15 @@ def simulate_rows(
 ) -> list[MeasuredPush]:
     """Simulate measured pushes of a finger into the sheet at all stretches and depths of a scene.
 
-    Each depth gives one push. If the rubber has hysteresis, each depth gives one push for loading
-    and one for unloading.
+    There is one push at each depth. If the rubber has hysteresis, there are two pushes at each
+    depth, one for loading and one for unloading.
 
     places: whether to push at several points of the sheet, not only at its centre.
     noise_n: standard deviation of the noise of the contact force, N. The noise of the edge force is
         ten times as large.
-    apparatus: true parameters of arms and sheet; None: the scene's parameters.
-    progress: function that is called with the number of finished combinations and the number of all
-        combinations.
+    apparatus: true parameters of the arms and the sheet. If None, the scene's parameters are used.
+    progress: function that is called after each combination of stretch and contact point. Its
+        arguments are the number of finished combinations and the number of all combinations.
     """
     rng = np.random.default_rng(seed)
     sheet = SimulatedSheet(scene, apparatus or nominal_apparatus(scene))

@@ -29,18 +29,18 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 JUST_TAUT_TENSION = 2e-6
-"""The residual tension of slack rubber, divided by the shear modulus, for an almost taut sheet.
+"""The small tension of slack rubber in the model, divided by the shear modulus.
 
-The simulator in a running graph uses a value that is a hundred times as large, because its sheet
-can hang slack. That tension would triple the force of a small push into a sheet that is barely
-slack.
+This value is used if the edges are far enough apart to make the sheet taut. The simulator in a
+running graph uses a value that is a hundred times as large, because its sheet can hang slack. The
+larger value would triple the force of a small push into a sheet that is just taut.
 """
 
 PUSHED_CELLS, UNTOUCHED_CELLS = 24, 16
 """The numbers of mesh intervals along each side of a pushed sheet and of an untouched sheet.
 
-Forces that are computed with 24 and with 32 intervals differ by 0.5 %, and at a depth of 2 mm by 1
-%.
+Forces that are computed with 24 and with 32 intervals differ by 0.5 %. At a depth of 2 mm, they
+differ by 1 %.
 """
 
 
@@ -75,7 +75,7 @@ def _push(
     """Simulate a push, and return (normal force, force on a clamped edge), in N, at each depth.
 
     edges: poses (4, 4) of the left and the right clamped edge.
-    depths_m: ascending depths behind the flat sheet midway between the edges.
+    depths_m: ascending depths of the finger behind the plane of the flat sheet.
     point_m: pushed point (x, y), relative to the centre of the flat sheet.
     cells: number of mesh intervals along each side of the sheet.
     """
@@ -136,8 +136,8 @@ class SimulatedSheet:
     ) -> list[tuple[tuple[float, float], float]]:
         """Simulate a push, and return the forces (N) at each depth.
 
-        Each entry is ((normal force during loading, normal force during unloading), force on a
-        clamped edge).
+        Each entry of the result has the form ((normal force during loading, normal force during
+        unloading), force on a clamped edge).
 
         distance_m: commanded distance between the edges.
         depths_m: ascending depths of the ball behind the flat sheet.
@@ -198,10 +198,10 @@ def solve_sheet(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> DeformedSheet:
-    """Compute the shape of the simulated sheet between two edges, which a fingertip can touch.
+    """Compute the shape of the simulated sheet between two edges, with or without a fingertip.
 
     world_from_left_edge, world_from_right_edge: poses (4, 4) of the clamped edges.
-    finger_tip: position (3,) of the fingertip; None: nothing touches the sheet.
+    finger_tip: position (3,) of the fingertip. If None, nothing touches the sheet.
     """
     return solve(
         true_rubber(scene.sheet, None),
@@ -221,8 +221,8 @@ def make_error_function(
     """Return a function that computes the errors of the image that the user sees on the sheet.
 
     The arguments of the returned function are two projector images, which encode the x and the y
-    coordinate as brightness (coordinate ramps). Its result is the error (n,), in m, at each point
-    of the simulated sheet that the eye can see.
+    coordinate as brightness (coordinate ramps). The returned function computes the error (n,), in
+    m, at each of n points of the simulated sheet that the eye can see.
     """
     sheet = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m

@@ -49,14 +49,17 @@ from flexsheet.messages.scene import Lens
 from flexsheet.nodes.arrays import Floats
 
 MAX_DEPTH_ERROR_FRACTION = 0.05
-"""The maximum depth error of a valid calibration, as a fraction of the working distance."""
+"""The maximum standard deviation of depth in a valid calibration.
+
+The value is a fraction of the working distance.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """A stereo calibration with its fit and its image pairs, for a report.
+    """A stereo calibration with the data that its report shows.
 
-    pairs: board corners of the used pairs, by index among all pairs.
+    pairs: board corners of each used pair, by the index of the pair among all pairs.
     size: width and height of the images, px.
     """
 
@@ -77,13 +80,13 @@ def calibrate_stereo(
 ) -> CalibrationResult:
     """Calibrate a stereo camera from pairs of images of a board.
 
-    A pair is excluded if it does not show the board or repeats the pose of another pair. It is also
-    excluded if it contradicts the other pairs (`compute_misfits`). Corners with residuals above six
-    standard deviations are also excluded. A pair is excluded if its residual exceeds both half a
-    pixel and three times the median. The result contains the reason for each excluded pair.
+    A pair is excluded if it does not show the board, or if it repeats the board pose of another
+    pair. It is also excluded if it contradicts the other pairs (`compute_misfits`), or if its
+    residual exceeds both half a pixel and three times the median. A corner is excluded if its
+    residual exceeds six standard deviations. The result contains the reason for each excluded pair.
 
-    working_distance_m: distance to which the uncertainty applies; None: median distance of the
-        boards.
+    working_distance_m: distance from the camera for which the uncertainty is computed. If None, the
+        median distance of the boards is used.
 
     Raises CalibrationError if images cannot be used, if fewer than MIN_PAIRS pairs remain, or if
     the pairs do not determine the rig.
@@ -149,14 +152,15 @@ def compute_uncertainty(
     distance_m: float | None,
     progress: Progress = ignore_progress,
 ) -> Uncertainty:
-    """Compute the covariance of a rig, and the resulting uncertainty of a measured fingertip.
+    """Compute the covariance of a rig's parameters, and the uncertainty of a measured fingertip.
 
     If the results of jackknife refits scatter more than the covariance of the fit predicts, the
     covariance is increased accordingly.
 
     points: corners of the board (n, 3), m.
     size: width and height of the images, px.
-    distance_m: distance of the fingertip from the camera; None: median distance of the boards.
+    distance_m: distance of the fingertip from the camera. If None, the median distance of the
+        boards is used.
     """
     if distance_m is None:
         middles = [pose_transform(pose) @ [*points.mean(axis=0), 1.0] for pose in fit.poses]
@@ -179,6 +183,9 @@ def compute_uncertainty(
 
 
 def make_lens(numbers: Floats) -> Lens:
-    """Make a lens from eight numbers: fx, fy, cx, cy (px), and the distortion k1, k2, p1, p2."""
+    """Make a lens from eight numbers.
+
+    numbers: parameters fx, fy, cx, cy (px) and distortion coefficients k1, k2, p1, p2.
+    """
     fx, fy, cx, cy, k1, k2, p1, p2 = (float(number) for number in numbers)
     return Lens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=(k1, k2, p1, p2, 0.0))

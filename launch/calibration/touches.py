@@ -63,9 +63,9 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 
 
 def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) -> dict[str, float]:
-    """Convert a row of the CSV file to numbers, by column.
+    """Convert the values in a row of the CSV file to numbers.
 
-    Errors in the row are appended to `problems`.
+    Return the numbers by column. Errors in the row are appended to `problems`.
 
     where: location of the row, as FILE:LINE.
     """
@@ -108,7 +108,7 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (35, -20))  # fmt: skip
 """The orientations of the finger in which the marker is measured before the touches.
 
-Each orientation is given as tilts about x and y, in degrees.
+Each orientation is given as tilts (degrees) about x and y from the usual orientation of the finger.
 """
 TOUCHED_ORIENTATIONS = 6
 """The number of orientations in which points are touched.
@@ -118,7 +118,7 @@ These are the orientations in which the measured marker has the smallest uncerta
 SIMULATED_POINTS_M = np.array([[x, y, 0.01] for y in (0.0, 0.04) for x in (-0.03, 0.01, 0.05)])
 """The n simulated points (n, 3), in m, that the finger touches: corners of a simulated board."""
 SIMULATED_CORNER_M, SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, 1e-4, math.radians(1.0)
-"""The standard deviations per axis of measured corners (m), pad positions (m) and tilts (rad)."""
+"""The standard deviations per axis of errors of corners (m), pad positions (m) and tilts (rad)."""
 
 
 def simulate_touches(
@@ -131,13 +131,13 @@ def simulate_touches(
     """Simulate touches of known points, as observed by the simulated stereo camera.
 
     First, the marker is measured in all orientations of `SIMULATED_TILTS_DEG`, relative to the
-    usual orientation of the finger. Then the finger touches each point in the orientations with the
-    smallest uncertainty. The fit assumes that the usual orientation is the `direction_world` of the
-    scene. The fitted offset is therefore valid during normal use. A touch is omitted if the
-    detector does not accept the marker.
+    usual orientation of the finger. Then the finger touches each point in the orientations in which
+    the measured marker has the smallest uncertainty. The fit assumes that `direction_world` in the
+    scene is the usual orientation. The fitted offset is therefore valid during normal use. A touch
+    is omitted if the detector does not accept the marker.
 
     apparatus: true parameters of the simulated hardware.
-    calibration: camera parameters that the detector uses; None: the scene's parameters.
+    calibration: camera parameters for the detector. If None, the scene's parameters are used.
     """
     geometry = StereoGeometry.of(scene.camera, calibration)
     true_scene = apply_apparatus(scene, apparatus)
@@ -180,7 +180,9 @@ def simulate_touches(
 def _see_marker(
     camera: TwinCamera, scene: Scene, geometry: StereoGeometry, pad: Floats
 ) -> TriangulatedPoint | None:
-    """Return the marker that the detector finds in simulated images, or None if it finds none.
+    """Return the marker that the detector finds in simulated images.
+
+    Return None if the detector does not find a marker.
 
     pad: position (3,) of the fingertip's pad.
     """

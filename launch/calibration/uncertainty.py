@@ -1,9 +1,9 @@
 """Compute the error of a measured fingertip that results from the uncertainty of the stereo rig.
 
 To first order, the error follows from the covariance of the rig's parameters. A delete-a-group
-jackknife repeats the fit several times, each time with some pairs omitted. It also includes the
-effects of errors that corners have in common, of a warped board, and of deviations from the lens
-model.
+jackknife repeats the fit several times, each time with some pairs omitted. The jackknife also
+includes the effects of errors that several corners have in common, of a warped board, and of
+deviations from the lens model.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) 
     """Return points (n, 3), in m, at the depth `distance_m` in the left camera's frame.
 
     The points are a grid of 5 x 5 over the central half of the left image's width and height.
-    Points outside the right image are omitted.
+    Points outside the right image are omitted, unless all points are outside.
 
     rig: parameters of the stereo rig (22,).
     size: width and height of the images, px.
@@ -62,7 +62,7 @@ def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
 
     The pixels p = f(x, rig) are fixed, and the position x has the least squared image error.
     Therefore, A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig. The
-    derivative is dx/drig = -(A'A)^-1 A'B, with the shape (n, 3, 22).
+    derivative is dx/drig = -(A'A)^-1 A'B, with the shape (n, 3, 22) for n points.
 
     rig: parameters of the stereo rig (22,).
     points: triangulated points (n, 3), m.
@@ -87,7 +87,7 @@ def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
 def compute_position_std(slopes: Floats, covariance: Floats) -> tuple[float, float]:
     """Return the standard deviations (depth, lateral), in m, of triangulated points.
 
-    Each is a root mean square over the points. The lateral value combines x and y.
+    Each value is a root mean square over n points. The lateral value combines x and y.
 
     slopes: derivatives (n, 3, 22) of the positions with respect to the rig's parameters.
     covariance: covariance matrix (22, 22) of the rig's parameters.

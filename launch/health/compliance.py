@@ -46,11 +46,11 @@ LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 FINGERTIP_AGE_S = 0.012
 """The assumed age (s) of a fingertip position when it is published.
 
-It is the sum of half an exposure, the read-out time of the camera, and the computing time.
+The age is the sum of half an exposure, the read-out time of the camera, and the computing time.
 """
 
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""The push depths that the report lists, divided by the maximum push depth."""
+"""The push depths that the report lists, as fractions of the maximum push depth."""
 
 
 def compute_front_curve(
@@ -61,11 +61,11 @@ def compute_front_curve(
 ) -> Floats:
     """Return the force of the object as a function of push depth, on the side that faces the user.
 
-    The result has rows (n, 2) of depth (m) and force (N). The linear method is used only if the
-    scene chooses it. Otherwise, the nonlinear table of the object is used. If this table is not
-    cached, its computation takes minutes.
+    The result is an array (n, 2). Each of the n rows contains a depth (m) and a force (N). The
+    linear soft-body method is used only if the scene chooses it. Otherwise, the nonlinear table of
+    the object is used. If this table is not cached, its computation takes minutes.
 
-    cache_dir: folder of the cache; None: the user's cache folder.
+    cache_dir: folder of the cache. If None, the user's cache folder is used.
     on_progress: function that is called with the number of finished steps and the number of all
         steps.
     """
@@ -92,13 +92,13 @@ def compute_compliance(
     max_depth_m: float | None = None,
     bounds: OffsetBounds | None = None,
 ) -> Compliance:
-    """Compute the offsets of the sheet that render the object's force.
+    """Compute the offsets of the sheet along its normal that render the object's force.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.
-    max_depth_m: maximum push depth; None: the depth in the scene.
-    bounds: limits within which the offset keeps the control loop of sheet and hand stable; None: no
-        limits.
+    max_depth_m: maximum push depth. If None, the depth in the scene is used.
+    bounds: limits of the offset within which the control loop of sheet and hand is stable. If None,
+        the offset is not limited.
     """
     limits = make_stretch_limits(scene.sheet, law, bounds)
     return fit_compliance(curve, law, limits, scene, max_depth_m=max_depth_m)
@@ -107,9 +107,9 @@ def compute_compliance(
 class LoopRisk(StrEnum):
     """The risk that the control loop of sheet and hand is unstable or renders a wrong force.
 
-    OSCILLATION: a hand of low damping can oscillate, because the sheet moves away too late.
-    DELAY: because of the delay, the sheet cannot render the object's force within the stability
-        limits.
+    OSCILLATION: a hand of low damping can oscillate, because the sheet follows the finger too late.
+    DELAY: the sheet cannot render the object's force within the stability limits that result from
+        the delay.
     SHEET: the sheet cannot render the object's force, even if there is no delay.
     """
 
@@ -131,7 +131,7 @@ class LoopFinding:
     error_ratio: float
 
     def describe(self) -> str:
-        """Return a text that describes the risk and what to do about it."""
+        """Return a text that describes the risk and a remedy."""
         delay_ms, error_percent = 1e3 * self.delay_s, 100.0 * self.error_ratio
         match self.risk:
             case LoopRisk.OSCILLATION:
@@ -165,7 +165,7 @@ def find_loop_risk(
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.
-    table: limits of the sheet's offset for a stable loop, by delay.
+    table: limits of the sheet's offset, by delay. Within these limits, the control loop is stable.
     delay_s: time from the measurement of a push depth until the sheet has moved.
     """
     bounded = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
@@ -183,8 +183,8 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     """Return the risk of the control loop of sheet and hand before a graph of nodes starts.
 
     The parameters of the planner determine the delay. Only cached data are used, because their
-    computation can take minutes. Return None if there is no risk. Return None also if the stability
-    limits or the soft body are not cached; the planner then reports the risk later.
+    computation can take minutes. Return None if there is no risk. Also return None if the stability
+    limits or the soft body are not cached. In this case, the planner reports the risk later.
     """
     scene = plan.scene_message()
     planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")

@@ -31,7 +31,7 @@ PROBE_S = 1.0
 """The duration (s) of the measurement of the processor load."""
 
 PROBE_PERIOD_S, PROBE_RUN_S = 1.0 / 140.0, 0.001
-"""The cycle period (s) of a node that controls an arm, and its processor time (s) per cycle."""
+"""The cycle period (s) of an arm control node, and the node's processor time (s) per cycle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +71,8 @@ def check_all() -> Iterator[Finding]:
 def check_load() -> Finding:
     """Check whether a process with the load of an arm control node gets a processor in time.
 
-    The function computes for PROBE_RUN_S in each PROBE_PERIOD_S, and measures how long it waits for
-    a processor.
+    For the duration PROBE_S, the function uses a processor for PROBE_RUN_S in each PROBE_PERIOD_S.
+    It measures how long it waits for the processor.
     """
     watch, own = CpuWatch(), {"this check": os.getpid()}
     watch.update(own, measure_programs=True)
@@ -96,7 +96,10 @@ def check_load() -> Finding:
 
 
 def check_python() -> Finding:
-    """Report the Python version. This module cannot be imported if the version is too old."""
+    """Report the Python version.
+
+    The version is not checked: if it were too old, this module could not be imported.
+    """
     return Finding("python", "ok", f"{sys.version.split()[0]} at {sys.executable}")
 
 
@@ -200,7 +203,7 @@ def check_sockets() -> Finding:
         return Finding(
             "sockets",
             "failed",
-            f"{directory} belongs to another user",
+            f"{directory} belongs to another user or is not writable",
             "set FLEXSHEET_RUNS to another folder",
         )
     count = len(list_live_runs())

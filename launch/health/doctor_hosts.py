@@ -1,7 +1,7 @@
 """Evaluate the probes of hosts, and return findings with remedies.
 
-A probe (`launch.health.probe`) contains the messages from one host. Each check of a host gives one
-finding. Checks of this computer give further findings.
+A probe (`launch.health.probe`) contains the messages that were received from one host. Each check
+of a probe returns findings. Further findings come from checks of this computer.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ The keys are the reasons why a launcher does not respond although its host is on
 
 SAME_COMMIT_REMEDY = "use the same commit on all hosts: git pull, make setup, and start again"
 SELF_CHECK = "self-check"
-"""The name of the check that lists the calibration errors that the nodes of a host suspect."""
+"""The name of the check for calibration errors that the nodes of a host suspect."""
 
 
 def evaluate_probes(
@@ -167,7 +167,10 @@ REQUIRED_FOR_CHECKS = {
     "touch_point_world_m": "the marker on the finger",
     "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
 }
-"""The quantity that an optional self-check tests, by the node parameter that enables the check."""
+"""The quantities that optional self-checks test.
+
+Each key is the node parameter that enables the self-check.
+"""
 
 
 def check_apparatus(
@@ -300,7 +303,7 @@ def _check_clocks(
 ) -> HostFinding:
     """Check that the clock offsets from a host to the other hosts are known accurately enough.
 
-    The limit of the uncertainty is set by the clock node of the graph.
+    The clock node of the host states the maximum uncertainty that is allowed.
     """
     finding = partial(HostFinding, probe.host, "clocks")
     if probe.clocks is None:
@@ -378,7 +381,10 @@ def _check_rates(probe: HostProbe) -> HostFinding:
 
 
 def find_rate_problem(port: PortStatus) -> str | None:
-    """Return why the message rate of a port is not as expected, or None if it is as expected."""
+    """Return a text if the message rate at an input or output of a node is not as expected.
+
+    Return None if the rate is as expected.
+    """
     topic = TOPICS.get(port.topic)
     if topic is None or topic.rate_hz is None or topic.many_writers:
         return None
@@ -398,7 +404,10 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; {OPENGL_REMEDY}",
     ),
 }
-"""The name and the remedy of the check whether a node publishes messages, by role of the node."""
+"""The name and the remedy of a check, by the role of the checked node.
+
+The check tests whether the node publishes messages.
+"""
 
 
 def _report_devices(
@@ -506,7 +515,7 @@ def _shorten(texts: Sequence[str]) -> list[str]:
 
 
 def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
-    """Return why the key of this computer cannot be used to connect to hosts.
+    """Return the reason why the key of this computer cannot be used to connect to other hosts.
 
     Return None if the key can be used.
 

@@ -52,7 +52,7 @@ TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
 
 VIEW_DISTANCE_M = 1.0
 DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
-"""The maximum differences between two duplicate contacts: position (m) and unit normal."""
+"""Two contacts are duplicates if their positions (m) and unit normals differ by less than this."""
 
 ROLL_STARTS = 24
 """The approximate number of contacts from which the sheet rolls to other contacts."""
@@ -64,7 +64,7 @@ OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
 """The offsets (m) of an arm's base along each world axis that are tried as a remedy."""
 
 TILT_STEP_RAD, DEPTH_STEP_M, SPEED_STEP_M_PER_S = 0.01, 0.001, 1e-4
-"""The steps between the values that are tried as remedies."""
+"""The steps between the tilt ranges, push depths and speeds that are tried as remedies."""
 
 PROGRESS_STEPS = 10
 """The maximum number of progress reports during the search for a base position."""
@@ -82,11 +82,12 @@ All samples are checked only if the arm reaches these samples from the base posi
 class ContactSample:
     """A contact of the finger with the object, and the pose of the sheet before a push.
 
-    tilt_rad: angle between the surface normal and the direction towards the user, positive upwards.
+    tilt_rad: angle between the surface normal and the direction towards the user. It is positive if
+        the surface faces upwards.
     contact_world_m: contact point (3,).
     world_from_sheet: pose of the sheet (4, 4).
-    twists_world: velocities (k, 6) of the sheet during k strokes at the working speed, m/s and
-        rad/s.
+    twists_world: linear (m/s) and angular (rad/s) velocities (k, 6) of the sheet during k strokes
+        at the working speed.
     """
 
     tilt_rad: float
@@ -99,7 +100,7 @@ class ContactSample:
 class LayoutSamples:
     """The n sampled sheet poses that the arms must reach.
 
-    tilt_rad: tilts (n,) of the contact.
+    tilt_rad: tilts (n,) of the contact, as defined in `ContactSample`.
     depth_m: push depths (n,).
     contact_world_m: contact points (n, 3).
     """
@@ -146,9 +147,9 @@ class Layout:
         return bool(self.reached.all()) and not self.blocked_paths
 
     def speed_m_per_s(self, fraction: float) -> float:
-        """Return the finger speed (m/s) that both arms can follow at a fraction of the samples.
+        """Return the finger speed (m/s) that both arms can follow at a given fraction of samples.
 
-        Only reachable samples are considered. Return 0 if there are none.
+        Only reachable samples are considered. Return 0 if no sample is reachable.
 
         fraction: fraction from 0 to 1.
         """
@@ -158,10 +159,10 @@ class Layout:
         return float(np.quantile(speeds[self.reached], 1.0 - fraction))
 
     def speeds_m_per_s(self, reach: ArmReach) -> Floats:
-        """Return the maximum finger speed (n,), in m/s, that an arm can follow at each sample.
+        """Return the maximum finger speeds (n,), in m/s, that an arm can follow at n samples.
 
-        The speeds of arm and sheet are assumed to be proportional to the speed of the finger. The
-        speed is NaN at unreachable samples.
+        The speeds of the arm and the sheet are assumed to be proportional to the speed of the
+        finger. At samples that the arm cannot reach, the result is NaN.
         """
         used = np.max([1.0 - reach.margins[limit] for limit in SPEED_LIMITS], axis=0)
         return np.asarray(self.scene.working_range.speed_m_per_s / used)
@@ -173,10 +174,11 @@ class Layout:
 def sample_contacts(scene: Scene) -> list[ContactSample]:
     """Sample contact points on the object, with sheet poses at each point.
 
-    The contact points are sampled from all directions within the scene's tilt range. At each
-    contact point, the object touches the centre of the sheet, or another point of the sheet that
-    has rolled there from another contact. For each axis of the sheet, the two rolls are used that
-    end farthest from the sheet's centre, limited to the sheet's usable size.
+    The contact points are sampled from all directions within the scene's tilt range. In the first
+    pose at each contact point, the object touches the centre of the sheet. In the other poses, the
+    sheet has rolled to this contact point from another contact, so the object touches another point
+    of the sheet. For each axis of the sheet, the two rolls are used that end farthest from the
+    sheet's centre. Contacts outside the sheet's usable area are moved to the border of this area.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)
@@ -261,7 +263,7 @@ def _list_contacts(
 
 
 def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
-    """Combine each contact with each push depth, and with both the minimum and maximum stretch.
+    """Combine each contact with each push depth, and with the minimum and the maximum stretch.
 
     A push moves the sheet along its normal. The arms must also follow a push at the scene's working
     speed.
@@ -298,10 +300,11 @@ def check_layout(
     progress: Progress = lambda text: None,
     on_reach: Callable[[Layout], None] = lambda layout: None,
 ) -> Layout:
-    """Check whether both arms reach the working range, and search for remedies if one does not.
+    """Check whether both arms reach the working range. If not, search for remedies.
 
     progress: function that is called with a description of each step.
-    on_reach: function that is called with the result before the search, which can take minutes.
+    on_reach: function that is called before the search, which can take minutes. Its argument is the
+        result without remedies.
     """
     progress("finding the contacts on the object")
     found = _check_reach(scene, sample_contacts(scene), progress)
@@ -310,7 +313,7 @@ def check_layout(
 
 
 def _check_reach(scene: Scene, contacts: Sequence[ContactSample], progress: Progress) -> Layout:
-    """Return the result of the layout check, but search for no remedies."""
+    """Return the result of the layout check without remedies."""
     samples = make_samples(scene, contacts)
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
     progress(f"{len(samples.poses)} poses of the sheet, left arm")
@@ -396,10 +399,12 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
 
 
 def _find_largest(scene: Scene, key: str, step: float, progress: Progress) -> float | None:
-    """Return the largest value of one key with which the whole working range is reachable.
+    """Return the largest limit of the working range with which both arms reach all samples.
 
     The search is a bisection over the multiples of `step` below the value in the scene. Return None
-    if no tested value makes all samples reachable.
+    if all tested values are too large.
+
+    key: name of the limit in the scene, such as `tilt_rad`.
     """
     low, high = 0, math.ceil(round(getattr(scene.working_range, key) / step, 6))
     number, count = 0, math.ceil(math.log2(max(high, 1)))
@@ -445,7 +450,7 @@ def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
 
 
 def _find_base_offset(layout: Layout, side: Side, progress: Progress) -> Floats | None:
-    """Return the smallest displacement (3,), in m, of a base that makes all samples reachable.
+    """Return the smallest base displacement (3,), in m, with which the arm reaches all samples.
 
     Return None if no tested displacement is sufficient.
     """
@@ -509,12 +514,13 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the fraction of the samples for which a given limit is the most violated limit.
+    """Return the fraction of samples that violate a given limit more than all other limits.
 
-    The result also contains the sample with the smallest tilt among these samples.
+    The result also describes the sample that has the smallest tilt among these samples.
 
-    number: index of the limit.
-    binding: index (n,) of the most violated limit of each sample; -1 for reachable samples.
+    number: index of the given limit.
+    binding: for each of n samples, index (n,) of the limit that is violated most; -1 for reachable
+        samples.
     """
     where = np.flatnonzero(binding == number)
     samples = layout.samples
@@ -532,7 +538,8 @@ def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> 
 def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float | str]]:
     """Return the minimum margin of each kind of limit, and the sample that has this margin.
 
-    Each value contains the limit, the margin with its unit, the tilt (rad) and the push depth (m).
+    For each kind, the result contains the limit, the margin with its unit, and the tilt (rad) and
+    push depth (m) of the sample.
     """
     kinds = {
         "joint range": (RANGES, "rad"),
@@ -563,7 +570,7 @@ def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, flo
 
 
 def draw_layout(layout: Layout, path: Path) -> None:
-    """Draw the limits that each arm violates, and the finger speeds that it can follow.
+    """Draw the limits that each arm violates, and the finger speeds that each arm can follow.
 
     The axes of the image are the tilt of the contact and the push depth.
 
@@ -600,7 +607,10 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 
 def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index (n,) of the limit that each sample violates most; -1 if none is violated."""
+    """Return the index (n,) of the limit that each of n samples violates most.
+
+    The index is -1 if a sample violates no limit.
+    """
     return np.where(reach.reachable, -1, reach.binding)
 
 
@@ -608,8 +618,8 @@ def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
 class _TiltDepthGrid:
     """A grid over the tilt and push depth of samples.
 
-    rows, columns: indices (n,) of the cell of each sample.
-    frame: options of the plot.
+    rows, columns: row and column (n,) of the grid cell that contains each of n samples.
+    frame: options for drawing the grid with Matplotlib's `imshow`.
     """
 
     rows: NDArray[np.intp]
@@ -629,19 +639,25 @@ class _TiltDepthGrid:
         return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
 
     def minimum(self, values: Floats) -> Floats:
-        """Return the minimum (DEPTHS, TILTS) of values (n,) in each cell; NaN for empty cells."""
+        """Return the minimum of the values in each grid cell, as an array (DEPTHS, TILTS).
+
+        The minimum is NaN in cells that contain no value.
+
+        values: value (n,) of each of n samples.
+        """
         cells = np.full((DEPTHS, TILTS), np.inf)
         finite = np.isfinite(values)
         np.minimum.at(cells, (self.rows[finite], self.columns[finite]), values[finite])
         return np.where(np.isfinite(cells), cells, np.nan)
 
     def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Return the colour (DEPTHS, TILTS, 3) of the limit that is violated most in each cell.
+        """Return the red, green and blue values of each grid cell, as an array (DEPTHS, TILTS, 3).
 
-        This is the limit that most samples in the cell violate. The colour is paler if fewer
-        samples violate a limit.
+        The colour represents the limit that is violated most often in the cell. The colour is paler
+        if fewer samples violate a limit.
 
-        binding: index (n,) of the most violated limit of each sample; -1 for reachable samples.
+        binding: for each of n samples, index (n,) of the limit that is violated most; -1 for
+            reachable samples.
         colors: colour of each limit, by index.
         """
         from matplotlib.colors import to_rgb

@@ -18,8 +18,8 @@ OPENGL_REMEDY = f"on Debian: sudo apt-get install -y {' '.join(OPENGL_PACKAGES)}
 def find_opengl_problem() -> str | None:
     """Return why no OpenGL context can be created without a display, or None if it can be created.
 
-    A separate process tries to create the context. If a driver has failed once in a process, it
-    would fail again in the same process.
+    A separate process tries to create the context, because a driver that fails once in a process
+    always fails in this process.
     """
     code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
     result = subprocess.run(

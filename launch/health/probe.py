@@ -1,4 +1,4 @@
-"""Read the state of every host of a graph over the network, from one of its hosts.
+"""Read the state of every host of a graph over the network, from one of the graph's hosts.
 
 A running launcher publishes the state of its host on the topics `host`, `status`, `clocks`, and the
 topics of its arms. If no message arrives from another host, the probe finds the step at which the
@@ -37,7 +37,7 @@ The kernel needs 3 s to report that no host has the address.
 
 HANDSHAKE_S = 3.0
 MIN_LISTEN_S = 1.2
-"""The minimum time (s) for which messages are read.
+"""The minimum time (s) for which messages from a host are read.
 
 Nodes publish their message rates once per second.
 """
@@ -55,7 +55,7 @@ class Reachability(StrEnum):
 
     RESPONDING = "responding"
     LOCAL = "local"
-    """The host is this computer, and no graph is running here."""
+    """The host is this computer, and no graph is running on it."""
     NO_ROUTE = "no_route"
     UNREACHABLE = "unreachable"
     """No host has the address in the launch file."""
@@ -65,7 +65,7 @@ class Reachability(StrEnum):
     CLOSED = "closed"
     HANDSHAKE_TIMEOUT = "handshake_timeout"
     KEY_MISMATCH = "key_mismatch"
-    """The key of the host differs from its key in the launch file of this computer."""
+    """The key of the host differs from the host's key in the launch file of this computer."""
     KEY_REJECTED = "key_rejected"
     """The host rejects the key of this computer."""
     UNENCRYPTED = "unencrypted"
@@ -223,7 +223,7 @@ async def _listen(
 
     If no status message of the host arrives, the reachability of the probe becomes NO_RESPONSE.
 
-    find_source: function that returns the endpoint of a publisher.
+    find_source: function that returns the endpoint at which a given publisher can be read.
     timeout_s: maximum time for which messages are read.
     """
 

@@ -1,9 +1,9 @@
 """Plan measurements of several configurations in randomised blocks, and evaluate them.
 
 A block contains all configurations in random order, so that slow changes of the computer affect all
-of them equally. One configuration, the control, runs twice in each block. The ratio of its two runs
-shows which differences are only noise. Runs in a block are not independent, so confidence intervals
-are computed by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
+configurations equally. One configuration, the control, runs twice in each block. The ratio of its
+two runs shows which differences are only noise. Runs in a block are not independent, so confidence
+intervals are computed by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SEED = 20261123
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return one list of all configuration names per block.
+    """Return a list of all configuration names for each block.
 
     Each list is in a different random order.
     """
@@ -49,10 +49,12 @@ def bootstrap_median(values: Floats) -> Interval | None:
 
 
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
-    """Return the median ratio of positive values (n,) to the control's values in the same blocks.
+    """Return the median ratio of a configuration's values to the control's values.
 
-    The result contains the confidence interval of the median. The median is computed from
-    logarithms, so a ratio and its inverse have the same weight.
+    Values of the same block are compared. The result contains the confidence interval of the
+    median. The median is computed from logarithms, so a ratio and its inverse have the same weight.
+
+    values, control: positive values (n,), one for each of n blocks.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))
@@ -81,10 +83,10 @@ def attribute_error(parts: Floats) -> Floats:
 def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
     """Return the names of the points that no other point dominates (the Pareto front).
 
-    A point dominates another if one of its costs is lower and none is higher. Costs with
-    overlapping confidence intervals are considered equal.
+    A point dominates another point if at least one of its costs is lower and none is higher. Costs
+    with overlapping confidence intervals are considered equal.
 
-    points: costs of each point; smaller is better.
+    points: costs of each point, by name. Lower costs are better.
     """
     return [
         name

@@ -38,7 +38,7 @@ FAMILIES: dict[str, str] = {
     "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
     "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
-"""The location `module:NAME` of each method family, by its name on the command line."""
+"""The location `module:NAME` of each method family, by the family's name on the command line."""
 
 REPEATS = 30
 PROGRESS_PERIOD_S = 1.0
@@ -93,7 +93,7 @@ def measure_family(
     A trial is a combination of a method and a case. Each trial is requested and measured before the
     next one is requested, so that the family can release its data.
 
-    select: function that returns whether a trial is measured.
+    select: function that returns whether to measure a given trial.
     """
     family.prepare(scene, _make_reporter("computing the reference:", progress))
     points: list[Point] = []
@@ -107,9 +107,9 @@ def measure_family(
 
 
 def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Return a function (done, total) that reports the progress and the remaining time.
+    """Return a function that reports the progress and the remaining time at regular intervals.
 
-    It reports at regular intervals.
+    The arguments of the returned function are the numbers of finished steps and of all steps.
     """
     eta, last_s = EtaEstimator(), -math.inf
 
@@ -144,8 +144,9 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
     """Draw error against time on logarithmic axes, with a line along the Pareto front of each case.
 
-    If the method family has a `sweep_key`, errors and extra metrics are also drawn against this
-    property of the cases. In this diagram, a band shows the uncertainty of the reference.
+    The `sweep_key` of a method family is a property that varies between its cases. If the family
+    has a `sweep_key`, errors and extra metrics are also drawn against this property. In these
+    diagrams, a band shows the uncertainty of the reference.
     """
     from matplotlib.figure import Figure
 
@@ -236,10 +237,12 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 
 
 def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
-    """Draw a metric against the swept case property, with one line per method.
+    """Draw a metric against the property that varies between the cases, with one line per method.
 
-    If a case is outside the method's range, its marker is hollow. The uncertainty of the reference
-    is grey.
+    If a case is outside the method's range, its marker is hollow. A grey band shows the uncertainty
+    of the reference.
+
+    name: "error" or the name of an extra metric.
     """
     key, points = result["sweep_key"], result["points"]
 
@@ -297,7 +300,7 @@ def _has_reference(point: dict[str, Any]) -> bool:
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the cases of the points in order; each case occurs once."""
+    """Return the different cases of measured points, in the order in which they first occur."""
     cases: list[dict[str, Any]] = []
     for point in points:
         if point["case"] not in cases:
@@ -317,7 +320,8 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 def read_charts(folder: Path) -> list[dict[str, Any]]:
     """Read all chart results in a folder.
 
-    Method families are returned in the order of `FAMILIES`, followed by other benchmarks.
+    The results of method families are in the order of `FAMILIES`. The results of other benchmarks
+    follow.
     """
     order = list(FAMILIES)
     paths = sorted(

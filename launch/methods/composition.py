@@ -1,10 +1,11 @@
 """Find the cheapest combination of one method per method family that meets all tolerances.
 
 The error of each system metric is predicted from the measured errors of the processing stages.
-Independent random errors (spreads) add as squares. They are marker noise, tracking error at the
-time of use, and errors that no measurement of a method contains (planner, servo, calibration).
-Signed errors of force models and delays (biases) add linearly. The prediction decides which
-combination is run next in the graph. The measured errors of this run decide whether it is accepted.
+Independent random errors (spreads) add as squares. These are the marker noise, the tracking error
+at the time of use, and errors that no measurement of a method contains (planner, servo,
+calibration). Signed errors of force models and delays (biases) add linearly. The prediction decides
+which combination is run next in the graph. The measured errors of this run decide whether the
+combination is accepted.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ MAX_RUNS = 4
 """The maximum number of configurations that are tested in the graph."""
 
 EQUAL_RATIO = 1.05
-"""The ratio below which two errors of the system are considered equal."""
+"""Two errors of the system are considered equal if their ratio is below this value."""
 
 EQUAL_DELAY_RATIO = 1.5
-"""The ratio below which two latencies are considered equal.
+"""Two latencies are considered equal if their ratio is below this value.
 
 The 95 % latency of one configuration varies by about this ratio between the blocks of `flexsheet
 chart system` on an idle computer.
 """
 
 P95_OVER_RMS = 1.614
-"""The ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian vector."""
+"""The 95 % quantile of the length of a 3D Gaussian vector, divided by the length's rms value."""
 
 
 class SystemMetric(StrEnum):
@@ -51,7 +52,7 @@ class SystemMetric(StrEnum):
 
     @property
     def label(self) -> str:
-        """Return the name of the metric without its unit, as text."""
+        """Return the name of the metric in words, without the unit."""
         return self.value.rpartition("_")[0].replace("_", " ")
 
 
@@ -60,12 +61,12 @@ DELAYS = frozenset({SystemMetric.TO_ARM, SystemMetric.TO_LIGHT})
 
 @dataclass(frozen=True, slots=True)
 class StageOption:
-    """A method that can be chosen for a stage.
+    """A method that can be chosen for a processing stage.
 
-    cores: processor time per second.
+    cores: processor time (s) per second.
     spreads, biases: random errors (spreads) and signed errors (biases) that the method adds to
         system metrics. The errors are 95 % values; delays are in ms.
-    given: methods of other stages for which these values were measured.
+    given: methods of other stages that were used when these values were measured.
     outside: fraction of the scene's cases that are outside the method's stated range.
     """
 
@@ -89,9 +90,7 @@ Figures = Mapping[SystemMetric, float]
 class Unexplained:
     """The difference by which measured system metrics exceed the predicted metrics.
 
-    It is learned from runs of the graph.
-
-    This difference is added to later predictions.
+    The difference is learned from runs of the graph, and is added to later predictions.
     """
 
     parts: Figures = field(default_factory=dict)
@@ -112,7 +111,10 @@ class Unexplained:
 
 
 def predict(combination: Combination, unexplained: Unexplained | None = None) -> Figures:
-    """Predict the system metrics of a combination; spreads add as squares, biases add linearly."""
+    """Predict the system metrics of a combination of methods.
+
+    Random errors (spreads) add as squares. Signed errors (biases) add linearly.
+    """
     squares, sums = _add_up(combination)
     for metric, value in (unexplained or Unexplained()).parts.items():
         if metric in DELAYS:
@@ -126,7 +128,7 @@ def predict(combination: Combination, unexplained: Unexplained | None = None) ->
 def _add_up(
     combination: Combination,
 ) -> tuple[dict[SystemMetric, float], dict[SystemMetric, float]]:
-    """Return the sum of the squared spreads and the sum of the absolute biases, by metric."""
+    """Return, by metric, the sum of squared random errors and the sum of absolute signed errors."""
     squares: dict[SystemMetric, float] = {}
     sums: dict[SystemMetric, float] = {}
     for option in combination.values():
@@ -189,8 +191,8 @@ def excess(figures: Figures, tolerances: Figures) -> dict[SystemMetric, float]:
 class GraphRun:
     """A run of one combination of methods in the graph.
 
-    predicted, measured: 95 % values by metric; a metric that the run does not measure has its
-        predicted value in both.
+    predicted, measured: 95 % values by metric. If the run does not measure a metric, `measured`
+        contains the predicted value.
     exceeded: ratio of value to tolerance of each metric that exceeds its tolerance.
     """
 
@@ -206,7 +208,7 @@ class Composition:
     """The result of the search for a combination of methods.
 
     chosen: accepted combination, or the combination that exceeds the tolerances least.
-    runs: all runs.
+    runs: all runs of the graph, in order.
     """
 
     chosen: Combination
@@ -225,8 +227,10 @@ class Composition:
 
     @property
     def unmet(self) -> str:
-        """Return a sentence for the metrics that exceed their tolerance, and a sentence for the
-        stages whose method is out of range; an empty text if there are none."""
+        """Return sentences about metrics that exceed a tolerance, and about methods out of range.
+
+        The text is empty if there are no such metrics or methods.
+        """
         exceeded = ", ".join(metric.label for metric in self.last.exceeded)
         stages = ", ".join(stage for stage, option in self.chosen.items() if not option.in_range)
         sentences = []
@@ -247,7 +251,10 @@ class Composition:
         }
 
     def explain(self) -> list[str]:
-        """Return a sentence about the result, and one for each tolerance that is not met."""
+        """Return sentences about the result and its problems.
+
+        A problem is a tolerance that is not met or a method that is out of range.
+        """
         run = self.last
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
         if self.accepted:
@@ -278,7 +285,7 @@ class Composition:
 
 
 def name_methods(combination: Combination) -> dict[str, str]:
-    """Return the name of the method of each stage."""
+    """Return the names of the methods in a combination, by stage."""
     return {stage: option.method for stage, option in combination.items()}
 
 
@@ -291,16 +298,17 @@ def compose(
 ) -> Composition:
     """Find the cheapest combination of methods that meets all tolerances in a run of the graph.
 
-    1. Only combinations with the fewest cases outside the methods' ranges are considered. 2. The
-    cheapest combination whose predicted metrics meet the tolerances with the margin is run. 3. If
-    it exceeds a tolerance, all predictions are corrected, and the next combination is run. 4. The
-    search ends if no other combination is predicted to be better in the exceeded metrics. 5.
-    Finally, if the predicted errors were too large, cheaper combinations are run.
+    Only combinations with the fewest cases outside the methods' ranges are considered. First, the
+    cheapest combination is run whose predicted metrics meet the tolerances with the margin. If this
+    combination exceeds a tolerance in the run, all predictions are corrected, and the next
+    combination is run. This ends if no other combination is predicted to be better in the exceeded
+    metrics. Finally, if the predicted errors were too large, cheaper combinations are run.
 
-    If no combination can meet a tolerance, one near the smallest attainable value is chosen.
+    If no combination can meet a tolerance, a combination is chosen that is near the smallest
+    attainable value.
 
     run_graph: function that runs a combination and returns its metrics.
-    margin: fraction of each tolerance that predictions must leave.
+    margin: fraction of each tolerance that a predicted metric must leave unused.
 
     Raises ExperimentError if there is no combination.
     """
@@ -350,9 +358,9 @@ def compose(
 
 
 def _find_best(runs: Sequence[GraphRun], tolerances: Figures) -> int:
-    """Return the index of the run with the smallest excess over the attainable limits.
+    """Return the index of the run that exceeds the attainable limits (`_relax`) least.
 
-    If several runs exceed the limits equally, the cheapest is chosen.
+    If several runs exceed the limits equally, the index of the cheapest run is returned.
     """
     limits = _relax(tolerances, [run.measured for run in runs])
     return min(
@@ -369,11 +377,12 @@ def _find_cheaper(
 ) -> Combination | None:
     """Return the cheapest untested combination that costs less than the best run.
 
-    Only combinations are considered that are predicted to be as good as the best run.
+    Only combinations are considered that are predicted to be as good as the best run. Return None
+    if there is no such combination.
 
-    Returns None if there is no such combination. The errors of a method are worst-case errors, so
-    the sum of all methods overestimates the errors of the system. The predictions are therefore
-    multiplied by the ratio of measured to predicted errors of the best run.
+    The errors of a method are worst-case errors, so the sum over all methods overestimates the
+    errors of the system. The predictions are therefore multiplied by the ratio of measured to
+    predicted errors in the best run.
     """
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     limits = _relax(allowed, [best.measured])
@@ -392,7 +401,7 @@ def _find_cheaper(
 
 
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
-    """Return the cheapest combination whose predicted metrics are within the attainable limits.
+    """Return the cheapest combination that is predicted to be within the attainable limits.
 
     If no combination is within all limits, return the combination with the smallest excess.
 
@@ -408,17 +417,17 @@ def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figu
 
 
 def _outside(combination: Combination) -> float:
-    """Return the sum, over all methods, of the fraction of cases outside the method's range."""
+    """Return the fraction of cases that are outside a method's range, summed over all methods."""
     return sum(option.outside for option in combination.values())
 
 
 def _relax(limits: Figures, found: Sequence[Figures]) -> Figures:
-    """Raise the limits that are below the attainable values, and return the limits.
+    """Return the limits after raising each limit that is below the attainable value.
 
-    A returned limit is at least the smallest metric in `found`, multiplied by the ratio up to which
-    two values are considered equal.
+    The attainable value is the smallest value of the metric in `found`, multiplied by the ratio up
+    to which two values are considered equal.
 
-    found: metrics of the combinations.
+    found: metrics of each combination.
     """
     return {
         metric: max(
@@ -437,7 +446,7 @@ def _equal_ratio(metric: SystemMetric) -> float:
 def _sum_excess(figures: Figures, limits: Figures) -> float:
     """Return the sum of log(value / limit) over the metrics that exceed their limit.
 
-    Returns infinity if a value is not a number.
+    The result is infinite if a value is not a number.
     """
     ratios = excess(figures, limits).values()
     return math.inf if any(map(math.isnan, ratios)) else sum(map(math.log, ratios))

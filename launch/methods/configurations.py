@@ -33,7 +33,7 @@ NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "correction": ("renderer", "correction"),
     "compliance": ("planner", "compliance_mode"),
 }
-"""The node type and the node parameter that select the method, by key of `Methods`."""
+"""For each key of `Methods`, the node type and the node parameter that select the method."""
 
 NODE_DEFAULTS = Methods(
     marker="subpixel_fit",
@@ -104,8 +104,8 @@ class Configuration:
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
         """Compute and cache the tables that the methods need.
 
-        If a table were missing, a node would use another method, and this method would be measured
-        instead. The computation of the table of a soft body takes minutes.
+        If a table were missing, a node would use another method, and the wrong method would be
+        measured. The computation of the table of a soft body takes minutes.
         """
         if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)
@@ -116,12 +116,12 @@ class Configuration:
             precompute_soft_body(scene, body.skin_spacing_m, None, None, progress)
 
     def describe(self) -> dict[str, Any]:
-        """Return the methods and the planner's parameters, in the format of a sweep's trial."""
+        """Return the methods and the planner's parameters for the description of a trial."""
         return {"methods": self.methods.model_dump(mode="json"), "planner": dict(self.planner)}
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return the cheapest method of each family that covers the scene's working range.
+    """Return the cheapest method of each family whose range contains the scene's working range.
 
     Errors are not considered. If no method of a method family has a sufficient range, the method
     with the largest range is returned.
@@ -162,9 +162,9 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""The name of the configuration with which others are compared.
+"""The name of the configuration with which other configurations are compared.
 
-It runs twice in each block.
+This configuration runs twice in each block of measurements.
 """
 
 CONTROL_AGAIN = "tuned, again"
@@ -173,7 +173,8 @@ CONTROL_AGAIN = "tuned, again"
 def list_configurations(scene: Scene) -> list[Configuration]:
     """Return the configurations that are compared for a scene.
 
-    If the scene chooses no methods, "tuned" equals "default".
+    If the scene chooses no methods, the configurations "tuned" and "default" are equal, and
+    "default" is omitted.
     """
     tuned = choose_tuned(scene)
     found = [
@@ -201,9 +202,9 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
-    """Write a copy of a launch file that names another scene.
+    """Write a copy of a launch file, and replace the scene in the copy.
 
-    Relative paths become absolute in the copy.
+    Relative paths become absolute in the copy, and recording is disabled.
     """
     with edit_yaml(launch_file, target) as launch:
         launch["scene"] = str(scene_file.resolve())

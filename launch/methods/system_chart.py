@@ -1,10 +1,10 @@
 """Measure the speed and accuracy of the whole system for several configurations of its methods.
 
-Processor use and latency are measured in the running graph (`experiments/system_run.py`). A block
-contains all configurations. Results are medians over blocks, with the confidence intervals of these
-medians. Errors are 95 % values, computed in simulated time (`experiments/system_errors.py`). They
-are computed for the nominal apparatus (true parameters of the simulated hardware) and for random
-apparatuses. Each trial is a separate process.
+Processor use and latency are measured in the running graph (`experiments/system_run.py`). The
+measurement is repeated in blocks, each with a run of every configuration. Results are medians over
+blocks, with the confidence intervals of these medians. Errors are 95 % values that are computed in
+simulated time (`experiments/system_errors.py`). The nominal apparatus (set of true hardware
+parameters) and random apparatuses are used. Each trial is a separate process.
 """
 
 from __future__ import annotations
@@ -46,28 +46,31 @@ from flexsheet.nodes.twin.tolerance_table import Profile
 Progress = Callable[[str], None]
 
 NOMINAL = "errors-nominal"
-"""The name of the trial that computes the errors with the nominal apparatus."""
+"""The name of the trial that computes errors with hardware that does not deviate from the scene."""
 
 FIRST_SEED = 100
 """The seed of the first random apparatus; smaller seeds are reserved for development."""
 
 ORDER_SEED = 19
 FINGER_SEED = 5200
-"""The random seed of the finger in the first block; other charts use different seeds."""
+"""The random seed of the finger's motion in the first block.
+
+Each further block uses the next seed. Other charts use different seeds.
+"""
 
 ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
 LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
 QUANTILES = ("p50", "p95", "p99")
 COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
-"""The keys of the speed values for which ratios to the control configuration are computed."""
+"""The keys of the values for which ratios to the control configuration are computed."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneTrials:
     """The trials of one scene.
 
-    trials: description of each trial for the sweep, by name.
-    places: block and configuration of each trial.
+    trials: description of each trial, by trial name.
+    places: block and configuration of each trial, by trial name.
     common: settings that all trials share.
     """
 
@@ -84,6 +87,8 @@ def describe_errors(
 ) -> dict[str, Any]:
     """Return the description of a trial that computes errors of configurations with one apparatus.
 
+    apparatus: text that describes the true hardware parameters. If None, the hardware does not
+        deviate from the scene.
     seconds: duration of the stroke.
     """
     return {
@@ -105,11 +110,14 @@ def plan_trials(
     apparatuses: int,
     configurations: Sequence[str] = (),
 ) -> SceneTrials:
-    """Return the trials of one scene: first the errors, then the blocks in random order.
+    """Return the trials of one scene.
 
-    blocks: number of repetitions.
+    The first trials compute errors. The blocks follow, each with all configurations in random
+    order.
+
+    blocks: number of blocks.
     seconds: duration of each stroke.
-    apparatuses: number of random apparatuses.
+    apparatuses: number of random apparatuses (sets of true hardware parameters).
     """
     scene = load_scene(scene_file)
     return plan_configurations(
@@ -174,7 +182,7 @@ def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
 def run_scene(planned: SceneTrials, folder: Path, progress: Progress) -> dict[str, Row]:
     """Run the trials that have no result yet, and return all results by trial name.
 
-    Tables of the sheet that the methods need are computed first.
+    Tables that the methods need are computed first.
     """
     for one in planned.configurations:
         one.prepare(planned.scene, progress)
@@ -195,7 +203,7 @@ def run_system_chart(
 
     blocks: number of repetitions per scene.
     seconds: duration of each stroke.
-    apparatuses: number of random apparatuses.
+    apparatuses: number of random apparatuses (sets of true hardware parameters).
     """
     points: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
@@ -288,7 +296,7 @@ def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[
 
 
 def _good(rows: Mapping[str, Row], name: str) -> Row:
-    """Return the result row of a trial; return an empty row if the trial failed."""
+    """Return the result row of a trial, or an empty row if the trial failed."""
     row = rows.get(name, {})
     return {} if "error" in row else row
 
@@ -306,7 +314,8 @@ def summarize_configuration(
     have a row.
 
     rows: processor use and latencies by configuration and block.
-    errors, random: errors with the nominal apparatus, and errors with each random apparatus.
+    errors: errors with hardware that does not deviate from the scene.
+    random: errors with each random apparatus (set of true hardware parameters).
     """
     own, control = rows[name], rows.get(CONTROL, {})
     blocks = sorted(own)
@@ -374,7 +383,7 @@ def summarize_configuration(
 
 
 def upper_limit(one: Interval) -> float:
-    """Return the upper limit of an interval; if the limit is infinite, return the central value."""
+    """Return the upper limit of an interval, or the central value if the limit is infinite."""
     return one.high if np.isfinite(one.high) else one.value
 
 
@@ -398,7 +407,10 @@ def _median_by_key(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def worst_ratio(point: Mapping[str, Any]) -> Interval:
-    """Return the largest ratio of error to tolerance of a point, where latencies are ignored."""
+    """Return the largest ratio of an error to its tolerance for a point of the chart.
+
+    Latencies are not considered.
+    """
     ratios = [
         Interval(**one)
         for key, one in point["tolerance_ratios"].items()
@@ -410,8 +422,8 @@ def worst_ratio(point: Mapping[str, Any]) -> Interval:
 def find_system_front(points: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the names of a scene's configurations that are on the Pareto front.
 
-    Costs are the latency from exposure to arm, the processor cores, and the worst error relative to
-    its tolerance.
+    The compared costs are the latency from exposure to arm, the processor cores, and the worst
+    error relative to its tolerance.
     """
     costs = {}
     for point in points:

@@ -32,8 +32,9 @@ def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
     """Draw one row of two diagrams per scene, and save the figure as SVG.
 
     The left diagram shows the worst error against the latency. The right diagram shows all errors
-    of each configuration. A filled point represents a configuration that meets all tolerances. A
-    cross represents one that exceeds a tolerance. Bars are 95 % confidence intervals.
+    of each configuration. A circle represents a configuration that meets all tolerances, and a
+    cross represents a configuration that exceeds a tolerance. The markers of configurations on the
+    Pareto front are filled. Bars are 95 % confidence intervals.
     """
     from matplotlib.figure import Figure
 
@@ -99,7 +100,10 @@ def _draw_front(
 
 
 def _allowed_ms(points: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the scene's maximum latency (ms) from exposure to arm command; None if it has none."""
+    """Return the scene's maximum latency (ms) from exposure to arm command.
+
+    Return None if no point states this latency.
+    """
     key = "exposure_to_arm_ms.p95"
     for point in points:
         if key in point["spread"] and point["tolerance_ratios"][key]["value"] > 0.0:
@@ -116,7 +120,7 @@ def _failing(point: Mapping[str, Any]) -> str:
 def _bars(one: Interval, y: float) -> list[list[float]] | None:
     """Return the lengths of the error bars below and above the value y.
 
-    Returns None if the interval is not finite.
+    Return None if the interval is not finite.
     """
     if not np.isfinite([one.low, one.high]).all():
         return None

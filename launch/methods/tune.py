@@ -2,8 +2,8 @@
 
 A method family contains interchangeable methods for one task. The methods are measured on this
 computer over the scene's working range. A method is sufficient if its stated range contains the
-working range. Its maximum error must also be smaller than the scene's tolerance minus a margin. If
-no method is sufficient, the best insufficient method is chosen and reported.
+working range. Its maximum error must also be at most the scene's tolerance minus a margin. If no
+method is sufficient, the best insufficient method is chosen and reported.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ REPEATS = 10
 MARGIN = 0.2
 """The fraction of a tolerance that is reserved for errors in cases that were not measured."""
 TIE_RATIO = 1.1
-"""The ratio of the times of two methods below which both are considered equally fast.
+"""Two methods are considered equally fast if the ratio of their times is at most this value.
 
-If several methods are equally fast, the most accurate one is chosen.
+If several methods are equally fast, the most accurate method is chosen.
 """
 
 Setting = str | dict[str, Any]
@@ -64,10 +64,11 @@ class Tunable:
     """A method family from which a scene can choose one method.
 
     families: locations `module:NAME` of the `Family` objects that form the method family, in the
-        order of measurement. Later objects take minutes to prepare, and are measured only if no
-        earlier method is sufficient.
-    settings: value to write into the scene, by the method's name in the chart.
-    required_key: dotted key that a scene must have; otherwise no node uses the method family.
+        order of measurement. The methods of a later object take minutes to prepare. They are
+        measured only if no earlier method is sufficient.
+    settings: values that can be written into the scene, by the method's name in the chart.
+    required_key: dotted key of the scene. If the scene does not have this key, no node uses the
+        method family. None if no key is required.
     """
 
     name: str
@@ -137,20 +138,21 @@ TUNABLES = (
 )
 """The tunable method families in the order of tuning.
 
-The sheet shape precedes the image correction, because the settings of the correction depend on it.
+The sheet shape precedes the image correction, because the settings of the correction depend on the
+sheet shape.
 """
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""The chart's names of the two-pass image correction, by the method of the sheet shape."""
+"""The name of the two-pass image correction in the chart, by the method of the sheet shape."""
 
 
 def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
     """Return the tunable method families that the scene uses, in the order of tuning.
 
-    names: names of the method families; if empty, all are returned.
+    names: names of the method families. If empty, all families that the scene uses are returned.
 
     Raises UnknownTunableError if a name is unknown, or if the scene does not use the family.
     """
@@ -165,7 +167,7 @@ def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
         if names and not one.is_used(scene):
             raise UnknownTunableError(
                 f'scene "{scene.name}" does not use the method family "{one.name}": it has no '
-                f"`{one.required_key}`"
+                f"`{one.required_key}`; omit this family, or add that part to the scene"
             )
     return [one for one in chosen if one.is_used(scene)]
 
@@ -175,8 +177,8 @@ class MethodEvaluation:
     """The evaluation of one method over a scene's working range.
 
     median_s, slowest_s: median and maximum of the time per call over the cases.
-    error: maximum error within the method's stated range, which occurs in the case `worst_case`;
-        infinite if no reference is known.
+    error: maximum error within the method's stated range; infinite if no reference is known.
+    worst_case: case in which this error occurs.
     outside: cases outside the method's stated range.
     wrong: cases that have no reference, or whose error exceeds the tolerance minus the margin.
     points: measurements of all cases.
@@ -206,8 +208,8 @@ class MethodEvaluation:
 class Choice:
     """The chosen method of a method family, with the evaluations of all measured methods.
 
-    composed: whether the method was chosen for the errors of the whole system. In this case, the
-        tolerance of the method family alone does not determine the choice.
+    composed: whether the choice depends on the errors of the whole system. Otherwise, the choice
+        depends only on the tolerance of this method family.
     """
 
     family: str
@@ -224,9 +226,9 @@ class Choice:
 
     @property
     def spare_ratio(self) -> float:
-        """Return the fraction of the tolerance that remains.
+        """Return the fraction of the tolerance that the error leaves unused.
 
-        It is negative if the error is too large.
+        The result is negative if the error exceeds the tolerance.
         """
         return 1.0 - self.chosen.error / self.tolerance
 
@@ -313,7 +315,7 @@ def evaluate_methods(
     """Evaluate the methods in `settings` over all measured cases in the scene's working range.
 
     tolerance: maximum error.
-    margin: fraction of the tolerance that must remain.
+    margin: fraction of the tolerance that the error must leave unused.
     """
     allowed, evaluations = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
@@ -344,7 +346,7 @@ def evaluate_methods(
 def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
     """Return the fastest method that meets the tolerance over the working range.
 
-    If several methods are equally fast, the most accurate one is returned. If no method is
+    If several methods are equally fast, the most accurate method is returned. If no method is
     sufficient, the method with the fewest cases outside its range is returned.
     """
     sufficient = [one for one in evaluations if one.meets]
@@ -372,7 +374,8 @@ def tune(
 ) -> list[Choice]:
     """Measure the methods of each family in `tunables` in order, and choose one method per family.
 
-    If a method family does not support the scene's shape, mesh or sheet, its error is passed on.
+    If a method family does not support the scene's shape, mesh or sheet, the exception of the
+    method family is passed on.
 
     margin: fraction of each tolerance that is reserved.
     """
@@ -452,7 +455,7 @@ def _is_selected(methods: Mapping[str, Setting], trial: Trial) -> bool:
 
 METHODS = "methods"
 HEAD, UNMET_END = "# Chosen by `flexsheet tune`", "See docs/tune.md."
-"""The start of the generated comment, and the end of its line about unmet tolerances."""
+"""The start of the generated comment, and the end of the comment's line about unmet tolerances."""
 
 
 def insert_choices(
@@ -467,8 +470,10 @@ def insert_choices(
     """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
     All other text is unchanged, including the methods of other method families. If `methods` is a
-    mapping on one line, it is expanded to several lines. today, machine, commit: values for the
-    generated comment. unmet: sentences about tolerances that are not met, for the comment.
+    mapping on one line, it is expanded to several lines.
+
+    today, machine, commit: date, computer and git commit for the generated comment.
+    unmet: sentences for the comment about tolerances that are not met.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
@@ -512,10 +517,11 @@ def _make_line(choice: Choice, indent: str) -> str:
 class _Block:
     """The block `methods` of a scene file, with the indices of its lines.
 
-    start: first line, including the generated comment above it.
-    end: line after the block. If the file has no such block, both are the end of the file.
+    start: first line of the block or of the generated comment above the block.
+    end: line after the block. If the file has no such block, `start` and `end` are the end of the
+        file.
     header: the line `methods:` if it can be reused, otherwise empty.
-    parts: key and lines of each method family, in order; comments have an empty key.
+    parts: key and lines of each method family, in order. The key of a comment is empty.
     """
 
     start: int
@@ -602,7 +608,7 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
 def check_target(source: Path, target: Path) -> None:
     """Raise BadInputError if the target cannot be written.
 
-    The check runs before a long measurement, so that its result is not lost.
+    The check runs before a long measurement, so that the result of the measurement is not lost.
     """
     relocate_paths(_read(source), source, target)
     try:
@@ -636,7 +642,7 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice], unmet: 
     """Write the choices atomically into a scene file or into a copy of it.
 
     source: scene file.
-    target: file to write; if it is a symbolic link, the file that it points to is written.
+    target: file to write. If it is a symbolic link, the file to which the link points is written.
     unmet: as in `insert_choices`.
 
     Raises BadInputError if other parts of the scene would change, or if the target cannot be

@@ -44,7 +44,7 @@ from flexsheet.nodes.methods import Point
 from flexsheet.nodes.triangulator.tracking_benchmark import HORIZON_MS, make_tracking_family
 
 RENDERED_HZ = 30.0
-"""The maximum frame rate of the renderer in `launch/demo.yaml`, in hertz."""
+"""The maximum frame rate (Hz) of the renderer in `launch/demo.yaml`."""
 
 IMAGES = 2
 """The number of images per exposure in which the marker is detected."""
@@ -64,7 +64,10 @@ def list_tolerances(scene: Scene) -> dict[SystemMetric, float]:
 
 
 def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
-    """Measure the tracking methods with marker noise of `noise_px` (standard deviation, pixels)."""
+    """Measure and evaluate the tracking methods with simulated marker noise.
+
+    noise_px: standard deviation of the marker noise.
+    """
     from flexsheet.launch.methods.benchmarks import make_finger_motions
 
     family = make_tracking_family(make_finger_motions, noise_px)
@@ -76,9 +79,10 @@ def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
 def make_stages(scene: Scene, choices: Sequence[Choice]) -> dict[str, list[StageOption]]:
     """Return the methods of each tuned method family, with the errors that they add to the system.
 
-    Tracking is measured with the noise of each marker method. The tracking error at the time of
-    exposure adds to the fingertip's error. The tracking error at the longest prediction horizon
-    adds to the sheet's error. The image correction was measured only with the chosen sheet shape.
+    The tracking methods are measured with the noise of each marker method. The tracking error at
+    the time of exposure adds to the fingertip's error. The tracking error at the longest prediction
+    horizon adds to the sheet's error. The two-pass image correction can be used only with the
+    chosen sheet shape, because it was measured only with this shape.
     """
     stages: dict[str, list[StageOption]] = {}
     for choice in choices:
@@ -130,9 +134,11 @@ def _make_option(
 
 
 def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
-    """Return the largest finite absolute value over the points in the method's range.
+    """Return the largest finite absolute value over the measured points within the method's range.
 
     Return 0 if there is no finite value.
+
+    value: function that returns the value of a point.
     """
     found = [abs(value(point)) for point in points if point.in_range]
     return max((one for one in found if math.isfinite(one)), default=0.0)
@@ -173,13 +179,16 @@ def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]
 def _outside(one: MethodEvaluation) -> float:
     """Return the fraction of cases that are outside the method's range.
 
-    Return 1 if no reference is known.
+    Return 1 if the error of the method is unknown.
     """
     return len(one.outside) / one.cases if math.isfinite(one.error) else 1.0
 
 
 def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> list[Choice]:
-    """Return the choices, changed to the methods in `methods`, which are given by family."""
+    """Return the choices after replacing the chosen method of each method family.
+
+    methods: new methods by method family.
+    """
     return [
         replace(
             choice,
@@ -193,8 +202,8 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
 def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
     """Return the methods for a configuration of the scene.
 
-    If a family has no choice, the method of the scene is used. If the scene has none, the default
-    is used.
+    If there is no choice for a method family, the method in the scene is used. If the scene does
+    not choose a method either, the default is used.
     """
     chosen = {choice.key: choice.chosen.setting for choice in choices}
     return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
@@ -211,11 +220,11 @@ def tune_system(
 ) -> tuple[Composition, list[Choice]]:
     """Find the cheapest combination of measured methods that meets the tolerances of the system.
 
-    Returns the search result, and the choices for the scene.
+    Return the result of the search, and the choices for the scene.
 
-    runs: number of runs per combination; the largest 95 % value of these runs is used.
+    runs: number of runs per combination. The largest 95 % value of these runs is used.
 
-    Raises ExperimentError if all runs of a combination fail.
+    Raises ExperimentError if a run of a combination fails.
     """
     scene = load_scene(scene_file)
     progress("measuring the tracking with the noise of each marker method")
@@ -239,10 +248,10 @@ def run_proposal(
     *,
     runs: int,
 ) -> Figures:
-    """Return the system metrics of a configuration.
+    """Run a configuration, and return its system metrics.
 
-    Errors are 95 % values in simulated time. A latency is the largest 95 % value of `runs` runs of
-    the graph.
+    Errors are 95 % values that are computed in simulated time. A latency is the largest 95 % value
+    of `runs` runs of the graph.
     """
     planned = plan_configurations(
         scene_file, [configuration], folder, blocks=runs, seconds=STROKE_S
