@@ -56,8 +56,8 @@ def make_write_error(
 ) -> FileWriteError:
     """Make the error for a file that could not be written, with a remedy that fits the cause.
 
-    needed_bytes: size of the file, which the error text contains if the disk is full; None if
-        unknown.
+    needed_bytes: size of the file, which the error text contains if the disk is full; None if the
+    size is unknown.
     """
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):

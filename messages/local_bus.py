@@ -154,7 +154,9 @@ class LocalBus:
         self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
 
     def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
-        """Return the channel of the first endpoint that has a channel, or None if there is none."""
+        """Return the channel of the first endpoint that has a channel, or None if no endpoint has a
+        channel.
+        """
         return next((self._channels[one] for one in endpoints if one in self._channels), None)
 
 

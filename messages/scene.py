@@ -677,7 +677,7 @@ class MissingPartError(FlexsheetError, ValueError):
 
 
 def require_projector(scene: Scene) -> Projector:
-    """Return the scene's projector. Raises MissingPartError if the scene has none."""
+    """Return the scene's projector. Raises MissingPartError if the scene has no projector."""
     if scene.projector is None:
         raise MissingPartError(f'scene "{scene.name}": the key `projector` is missing')
     return scene.projector

@@ -349,7 +349,7 @@ def write_parquet(
 
     A slash in the name of a topic becomes a dot in the name of the file.
 
-    topics: names of the topics; None: all topics.
+    topics: names of the topics, or None for all topics.
     images: whether the tables contain images.
     progress: function that is called with the duration converted so far and the total duration (s).
 

@@ -26,7 +26,7 @@ NEVER_PLAYED = {
     "estop": "an e-stop or its reset is not repeated",
     "recording": "requests to record are not repeated",
 }
-"""The reason for each topic that is never played."""
+"""The topics that are never played, and the reason for each of these topics."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,8 @@ from flexsheet.messages.types import Correction, FingerPath
 METRES_PER_PX = 0.0007
 """The image resolution in Furukawa et al. 2007.
 
-It is sufficient for figures, and images take a quarter of the time of the default resolution.
+It is sufficient for figures. An image takes a quarter of the time that the default resolution
+needs.
 """
 
 SECONDS = (10.0, 30.0)
@@ -43,7 +44,7 @@ methods of image correction that are compared."""
 
 @dataclass(slots=True)
 class DemoResult:
-    """The results of the experiments of the demo that are finished.
+    """The results of all finished experiments of the demo.
 
     strokes: one result per stroke. followed: errors of the sheet along the given finger path; None
     if no path was given.
@@ -150,7 +151,7 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
 def evaluate_images(bag: Path, count: int) -> DemoResult | None:
     """Draw the images of the simulated eye in the first `count` cases of IMAGES.
 
-    Returns None if the bag does not yet contain all of them.
+    Returns None if the bag does not yet contain the images of all these cases.
     """
     images, rows = image.read_images(bag), []
     for series, value, corrections in IMAGES[:count]:

@@ -82,7 +82,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
 SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
-"""The unit vectors (7, 3) along which the tool speed is limited in both directions."""
+"""The 7 unit vectors along which the tool speed is limited, both forwards and backwards."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,12 +173,15 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the sparse matrix (steps - order, steps) that computes finite differences in time."""
+    """Return the sparse matrix (steps - order, steps) that computes finite differences in time.
+
+    steps: number of time steps. order: order of the differences.
+    """
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 
 def _block_rows(rows: Floats) -> csr_array:
-    """Return the block-diagonal matrix (n, n k) whose blocks are the rows (n, k)."""
+    """Return the block-diagonal matrix (n, n k) whose n blocks are the given rows of k numbers."""
     steps, width = rows.shape
     columns = np.arange(steps * width)
     owners = np.repeat(np.arange(steps), width)
@@ -230,14 +233,14 @@ class FollowedContact:
         self._distance_m = scene.sheet.width_m * 0.5 * (low + high)
 
     def contact_heights_m(self, positions_world: Floats) -> Floats:
-        """Return the heights (n,), m, of fingertips (n, 3) above the undeformed object."""
+        """Return the heights (n,), m, of n fingertips (n, 3) above the undeformed object."""
         local = apply(inverse(self._world_from_object), positions_world)
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
         """Return the sheets after rolling over the object to each finger position.
 
-        positions_world: (n, 3), m. The sheet starts at the front of the object.
+        positions_world: n finger positions (n, 3), m. The sheet starts at the front of the object.
         """
         object_from_world = inverse(self._world_from_object)
         front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))
@@ -331,10 +334,10 @@ def bound_errors(
     """Return a lower bound of the contact error for a finger path, in mm.
 
     The result contains the mean and the 95 % quantile (p95) over the steps in contact, for the
-    motion with the least mean. Steps whose exact sheet is out of reach, and windows without a
-    solution, count as zero.
+    motion with the least mean. The error is counted as zero in steps in which the arms cannot reach
+    the exact pose, and in windows that have no solution.
 
-    times_s: (n,), increasing.
+    times_s: n increasing times.
     positions_world: (n, 3), true fingertip, m.
 
     Raises ExperimentError if the path never touches the object.
@@ -383,7 +386,7 @@ def bound_errors(
 def _windows(reachable: Bools) -> list[slice]:
     """Divide the reachable time steps into windows of 3 to WINDOW_STEPS consecutive steps.
 
-    reachable: (n,), whether the arms reach the sheet in each time step.
+    reachable: whether the arms reach the sheet in each of the n time steps, (n,).
     """
     changes = np.flatnonzero(np.diff(reachable.astype(int))) + 1
     ends = [0, *changes.tolist(), len(reachable)]
@@ -406,7 +409,8 @@ def run_follow(
 ) -> dict[str, Any]:
     """Let the sheet follow a finger path, and return the results of `experiment follow --json`.
 
-    bag: file in which the running graph is recorded; None to follow the path in simulated time.
+    bag: file in which the running graph is recorded. If it is None, no graph is run, and the path
+    is followed in simulated time.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()

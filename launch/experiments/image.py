@@ -1,9 +1,9 @@
 """Measure the size errors of the image on an inclined sheet and on a pushed sheet.
 
 These are the experiments of Furukawa et al. 2007, section VI, Figs. 11 and 13. A correction is a
-method that corrects the image for the sheet's shape. A case is a pair of an angle or depth, and a
-correction. Its label is stored in the renderer's frames and in the simulated eye's images. The
-results are computed from the eye's images in the bag.
+method that corrects the image for the sheet's shape. A case combines an angle or a depth with a
+correction. The label of the case is stored in the renderer's frames and in the simulated eye's
+images. The results are computed from the eye's images in the bag.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def reach_path(
 ) -> FingerPath:
     """Return a finger path through points near the cylinder.
 
-    points: angle around the cylinder (rad) and height above its surface (m). along_m: position
-    along the cylinder's axis, from its centre.
+    points: angle (rad) around the cylinder and height (m) above its surface, for each point.
+    along_m: position along the cylinder's axis, from its centre.
     """
     radius = require_cylinder(scene).radius_m
     local = [
@@ -54,7 +54,10 @@ def reach_path(
 
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
-    """Return a finger path to a point above the cylinder where the sheet is inclined."""
+    """Return a finger path to a point above the cylinder.
+
+    theta_deg: angle of the point around the cylinder's axis, by which the sheet is inclined there.
+    """
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
@@ -64,7 +67,7 @@ def push_path(
     """Return a finger path that pushes the side of the cylinder to a depth.
 
     along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
-    front. Raises ExperimentError if the position is outside the limits.
+    front. Raises ExperimentError if the position is outside the limits that the error text names.
     """
     cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
@@ -82,7 +85,7 @@ class Series:
     """An image experiment in which one quantity varies.
 
     key: result column of the quantity.
-    name: format string of a case's name with the value.
+    name: format string that makes the name of a case from the value.
     path: function that makes the finger path for a value.
     sizes: function that measures sizes (m) of the cylinder in an image.
     size_names: symbols of the sizes in the paper.
@@ -237,8 +240,8 @@ def make_rows(
 ) -> list[dict[str, Any]]:
     """Return the results of an image experiment, one row per value and correction.
 
-    with_maps: add mean, 95 % quantile and maximum of the errors at all visible points. with_eyes:
-    add the errors of both eyes and of the disparity.
+    with_maps: whether to add mean, 95 % quantile and maximum of the errors at all visible points.
+    with_eyes: whether to add the errors of both eyes and of the disparity.
     """
     result = []
     for value in series.values:
@@ -260,7 +263,7 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum size error (mm) by correction method."""
+    """Return the mean and the maximum size error (mm) of each correction method."""
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),

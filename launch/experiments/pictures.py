@@ -23,7 +23,9 @@ EVENTS = tuple(event for event in LatencyEvent if event is not LatencyEvent.LIGH
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)
-"""The drawn part of the eye's image, as fractions of its size; outside it, the image is dark."""
+"""The drawn part of the eye's image, as fractions of its size; outside this part, the image is
+dark.
+"""
 
 CORRECTION_NAMES = {
     "none": "not corrected",
@@ -106,7 +108,9 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
 
 
 def draw_latency(recording: StrokeRecording, path: Path) -> None:
-    """Draw the latencies from exposure to each event, as medians and ranges from 1 to 99 %."""
+    """Draw the latencies from exposure to each event, as medians and as ranges between the 1 % and
+    99 % quantiles.
+    """
     events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
     figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
     axes = figure.subplots()
@@ -230,8 +234,9 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
 def draw_hand_gestures(forces: Mapping[tuple[str, str], FeltForce], path: Path) -> None:
     """Draw the felt force and the object's force against time.
 
-    The figure has one row per hand and one column per gesture. forces: forces by (kind of hand,
-    gesture).
+    The figure has one row per hand and one column per gesture.
+
+    forces: felt and object forces; a key is (kind of hand, gesture).
     """
     hands, names = (list(dict.fromkeys(key[number] for key in forces)) for number in (0, 1))
     figure = Figure(figsize=(3.4 * len(names), 2.2 * len(hands)), layout="constrained")

@@ -39,7 +39,8 @@ class SessionFinding:
 BRIEFLY_BUSY_FRACTION = 0.05
 """The maximum fraction of time for which an overload is reported only as a possible problem.
 
-A longer overload is reported as a failure. So is an overload during which an arm stopped.
+A longer overload is reported as a failure. An overload during which an arm stopped is also reported
+as a failure.
 """
 
 CHECKED = (
@@ -192,7 +193,10 @@ def _check_refused(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
 
 
 def _check_flow(name: str, topic: dict[str, Any]) -> Iterator[SessionFinding]:
-    """Yield the lost and delayed messages of a topic, which an overload can cause."""
+    """Yield a problem for lost messages and a problem for delayed messages of a topic.
+
+    An overload of a computer can cause both problems.
+    """
     expected, rate = topic["expected_hz"], topic["rate_hz"]
     if topic["lost"]:
         text = f"{name}: {topic['lost']} messages were lost between writer and readers."
