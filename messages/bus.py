@@ -1,7 +1,7 @@
 """Publish and subscribe by ZeroMQ sockets in the asyncio event loop.
 
 A publisher binds its socket and subscribers connect to it, in any order. Publishers and subscribers
-may be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
+can be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
 calls the handler there. `benchmarks/messaging.py` compares this design with others; this design has
 the smallest latency. A subscriber never waits in a `recv` call. Therefore a message cannot be lost
 because such a call is cancelled.
@@ -363,8 +363,8 @@ class Publisher:
 class Subscriber:
     """A subscriber of one topic, which calls `on_message(message, header)` in the event loop.
 
-    connect: endpoints of all nodes that publish the topic. A node may start after the subscriber,
-        and may restart.
+    connect: endpoints of all nodes that publish the topic. A node can start after the subscriber,
+        and can restart.
     counts: counters of superseded, lost and rejected messages.
     on_problem: function that is called with a text about a problem: the first rejection for each
         cause, and each exception in `on_message`. Lost messages are reported each time their number

@@ -342,7 +342,7 @@ class JointChain(ArmModel):
     kind: Literal["joint_chain"] = "joint_chain"
     origins: tuple[Pose, Pose, Pose, Pose, Pose, Pose] = Field(
         description="pose of each joint's frame in the frame of the previous joint, at angle 0; "
-        "the first one in the base"
+        "the pose of the first joint is in the base frame"
     )
     axes: tuple[Vector3, Vector3, Vector3, Vector3, Vector3, Vector3] = Field(
         description="unit vector of each joint's axis in its own frame"

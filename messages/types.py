@@ -450,8 +450,8 @@ class Frame(Message):
     )
     marks_finger_ratio: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks",))] = Field(
         default_factory=lambda: np.zeros(0),
-        description="displacement of the sheet at these marks, along its normal, divided by that "
-        "of the fingertip; 0 if there is no contact",
+        description="displacement of the sheet at these marks, along its normal, divided "
+        "by the displacement of the fingertip; 0 if there is no contact",
     )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, or one (mono or packed stereo)"
@@ -516,9 +516,11 @@ class ClockEcho(MessagePart):
     """A reply of a clock node to the newest ping from the clock node of another host."""
 
     clock_id: str
-    sent_ns: int = Field(ge=0, description="publish timestamp of the ping, on its own clock")
+    sent_ns: int = Field(
+        ge=0, description="publish timestamp of the ping, on the clock of its sender"
+    )
     received_ns: int = Field(
-        ge=0, description="time of its arrival, on the clock of this message's header"
+        ge=0, description="arrival time of the ping, on the clock of this message's header"
     )
 
 
@@ -584,7 +586,7 @@ class SelfCheck(MessagePart):
     """A comparison of a measured value with the value that a node expects."""
 
     cause: SuspectedCause
-    subject: str = Field(default="", description="device concerned, if there are several")
+    subject: str = Field(default="", description="device that was checked, if there are several")
     unit: Literal["m", "s", "px", "rad", "N/m"]
     value: Finite = Field(description="measured value, averaged over several seconds")
     expected: Finite = Field(description="value if everything is as assumed")
@@ -673,7 +675,7 @@ class ProgramCpu(MessagePart):
 class CpuPressure(MessagePart):
     """The time for which the nodes of a computer have waited for a free processor.
 
-    The time is measured over the last seconds. Nodes with a `nice` value of 10 or more are not
+    The time is measured over the last few seconds. Nodes with a `nice` value of 10 or more are not
     included.
     """
 

@@ -177,8 +177,8 @@ def _make_press(
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
     """Make the procedure that pushes at all positions of the experiment.
 
-    method: least accurate table of the soft body that is accepted. Before the first push, the
-    procedure waits until the soft body uses such a table.
+    method: least accurate method whose table is accepted. Before the first push, the procedure
+    waits until the soft body uses a table that is at least as accurate.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -272,7 +272,7 @@ class ForceSample:
     felt_n: force of the sheet.
     normal_offset_m: depth of the sheet centre below the undeformed surface.
     method: method of the soft body.
-    reference: force of the object from an independent solver, or None.
+    reference: force of the object that an independent solver computed, or None if none is stored.
     """
 
     depth_m: float

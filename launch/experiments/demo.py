@@ -38,8 +38,11 @@ IMAGES: tuple[tuple[image.Series, float, tuple[Correction, ...]], ...] = (
     (image.TILT, -40, ("none", "one_plane", "two_pass")),
     (image.PUSH, 30, ("none", "four_triangles", "two_pass")),
 )
-"""The image experiments: the varied quantity, its value (tilt in degrees, depth in mm), and the
-methods of image correction that are compared."""
+"""The image experiments.
+
+Each entry contains the varied quantity, its value (tilt in degrees, depth in mm), and the methods
+of image correction that are compared.
+"""
 
 
 @dataclass(slots=True)
@@ -71,8 +74,8 @@ def run_demo(
     """Run the demo on a graph, and report the result of each experiment when it is finished.
 
     The finger makes strokes of 10 s and 30 s, or follows `path`. Images of a tilted and of a pushed
-    sheet are captured. Results and figures are written to the folder of the bag. `report` receives
-    the results that are new.
+    sheet are captured. Results and figures are written to the folder of the bag. The function
+    `report` receives the new results.
     """
     procedure = chain_procedures(*make_demo_procedures(bag, progress, report, path))
     coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")

@@ -1,12 +1,12 @@
 """Simulate a sheet that follows a recorded finger, and compute a lower bound for its error.
 
-The bound is the optimum of a linear program over the whole recording, with the limits of the same
-arms. The linear program makes these assumptions:
+The bound is the optimum of a linear program over the whole recording, for the same arms and their
+limits. The linear program makes these assumptions:
 
 - The future of the finger is known. Therefore delays, tracking and prediction cause no error.
 - The sheet rolls on the undeformed object without slip, with a constant stretch.
 - Joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
-    limited as in the arm bridges. There is no servo lag and no limit of the jerk.
+    limited as in the arm bridges. There is no servo lag and no limit on the jerk.
 - While there is no contact, the sheet can move freely.
 - Joint angles change linearly with small deviations of the contact point.
 
@@ -113,7 +113,7 @@ def find_least_deviation(
     Return the lengths (n,) of the deviations; their weighted mean is a lower bound. Return None if
     no motion fulfils the limits.
 
-    weights: (n,), weights of the time steps.
+    weights: (n,), weights of the n time steps.
     step_s: time step.
     max_deviation: limit of each component of a deviation.
     """
@@ -201,7 +201,7 @@ class RolledSheet:
     on_sheet_m: Floats
 
     def pose(self, lifted_m: float = 0.0) -> Floats:
-        """Return the pose object_from_sheet (4, 4) after a shift `lifted_m` along the normal."""
+        """Return the pose object_from_sheet (4, 4) after a shift by `lifted_m` along the normal."""
         contact = self.on_sheet_m - np.array([0.0, 0.0, lifted_m])
         return transform(self.rotation, self.point - self.rotation @ contact)
 
@@ -338,7 +338,7 @@ def bound_errors(
     the exact pose, and in windows that have no solution.
 
     times_s: n increasing times.
-    positions_world: (n, 3), true fingertip, m.
+    positions_world: (n, 3), true fingertip positions, m.
 
     Raises ExperimentError if the path never touches the object.
     """

@@ -80,7 +80,9 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
     """
     scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:
-        raise ExperimentError(f'{launch_file}: missing key "scene", which a finger path requires')
+        raise ExperimentError(
+            f'{launch_file}: missing key "scene", which a finger path requires; add the key'
+        )
     if name_or_file in GESTURES:
         return gesture_path(name_or_file, scene)
     file = Path(name_or_file)
@@ -118,10 +120,11 @@ class TrueFinger:
     velocities: Floats
 
     def interpolate(self, times_ns: Times) -> Floats:
-        """Return the finger positions (m, 3) at m other times, by cubic Hermite interpolation.
+        """Return the finger positions (k, 3) at k other times, by cubic Hermite interpolation.
 
-        At 60 Hz the interpolation error is at most 45 um in the fastest taps, 13 um in slower taps
-        and 8 um otherwise. Positions in gaps between exposures, and outside the recording, are NaN.
+        At a camera rate of 60 Hz, the interpolation error is at most 45 um in the fastest taps, 13
+        um in slower taps and 8 um otherwise. Positions in gaps between exposures, and outside the
+        recording, are NaN.
         """
         zero = self.times_ns[0]
         seconds = (self.times_ns - zero) * 1e-9
@@ -239,15 +242,14 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
 
 
 def _stack_rows(points: Sequence[Floats]) -> Floats:
-    """Stack n points (3,) as rows of an array (n, 3); its shape is (0, 3) if there are no points.
-    """
+    """Stack n points (3,) as rows of an array (n, 3); n can be 0."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 
 def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
     """Return the tracking errors (mm) and delays (ms) in one gesture; unknown values are None.
 
-    missing: number of exposures without a fingertip.
+    missing: number of exposures for which no fingertip was published.
     reasons: number of invalid fingertips for each reason.
     jump: jumps between consecutive valid fingertips, see `jump_sigmas`.
     """

@@ -88,13 +88,13 @@ class Motion:
 
     @property
     def decays(self) -> NDArray[np.bool_]:
-        """Return a mask (n,) that is True for the cases in which no oscillation is sustained."""
+        """Return a mask that is True for the cases in which no oscillation is sustained."""
         died_out = self.amplitude_m <= MAX_AMPLITUDE_M
         return np.asarray(died_out | (self.decay_per_s >= SLOWEST_DECAY_PER_S))
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Return a mask (n,) that is True for stable cases.
+        """Return a mask that is True for the stable cases.
 
         A case is stable if its oscillation decays and the sheet delivers no energy.
         """

@@ -73,7 +73,8 @@ def push_path(
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
         raise ExperimentError(
             f"--at {along_mm:g} mm, --tilt {tilt_deg:g}°: the limits on the cylinder's side are "
-            f"±{500.0 * cylinder.length_m:g} mm and ±60° from the centre of its front"
+            f"±{500.0 * cylinder.length_m:g} mm and ±60° from the centre of its front; "
+            "give smaller values"
         )
     label, angle = f"push {depth_mm:g} mm", float(np.radians(tilt_deg))
     points = [(angle, HOVER_M), (angle, -depth_mm * 1e-3)]

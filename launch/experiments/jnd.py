@@ -290,7 +290,9 @@ class StaircaseSession:
         try:
             lines = list(csv.reader(io.StringIO(whole.decode())))
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ExperimentError(f"{self.file}: is not a CSV file of a session: {error}") from None
+            raise ExperimentError(
+                f"{self.file}: is not a CSV file of a session: {error}; give another folder"
+            ) from None
         if lines and tuple(lines[0]) != COLUMNS:
             raise ExperimentError(
                 f"{self.file}:1: the file has other columns than a session; give another folder"

@@ -274,7 +274,7 @@ class SimulatedArm:
 
     @property
     def lag_uncertainty_s(self) -> float | None:
-        """Return the standard deviation (s) of the measured servo lag; None if unknown."""
+        """Return the standard deviation (s) of the measured servo lag, or None if it is unknown."""
         return None if self._lag.estimate is None else self._lag.estimate.uncertainty_s
 
     def advance(self, until_s: float) -> Floats:
@@ -588,7 +588,8 @@ class TouchRecording:
     positions_m (n, 3): true fingertip positions.
     phases (n,): contact phase of the planner.
     steps (k, 3): time (s), indentation (m) and force (N) of the sheet in each of k time steps.
-    watchdog_triggers: number of oscillations that the planner stopped; None if unknown.
+    watchdog_triggers: number of oscillations that the planner stopped; None if the number is
+        unknown.
     delay_s: time from an exposure to the sheet's motion.
     """
 

@@ -173,7 +173,7 @@ def object_pose(scene: Scene) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SampledMotion:
-    """A sampled motion with times (n,) in ns, and k values at each time (n, k)."""
+    """A motion that is sampled at n times (ns), with k values at each time."""
 
     times_ns: NDArray[np.int64]
     values: Floats
