@@ -10,10 +10,10 @@ A subscriber has one socket per host, which identifies the host of each message.
 subscriber accepts only messages of the nodes that run there. Sockets that other computers can reach
 always use keys (`flexsheet.messages.security`).
 
-The file descriptor of a ZeroMQ socket is edge-triggered: its signal means that the state of the
-socket has changed, not that a message is ready. Any call on the socket can clear the signal. Each
-callback therefore reads until the socket is empty, or schedules itself again. No other code uses a
-socket that is being read.
+The file descriptor of a ZeroMQ socket is edge-triggered: its signal means only that the state of
+the socket has changed. A message need not be ready. Any call on the socket can clear the signal.
+Each callback therefore reads until the socket is empty, or schedules itself again. No other code
+uses a socket that is being read.
 """
 
 from __future__ import annotations
@@ -178,8 +178,8 @@ class Publisher:
         interface.
     on_refused: function that is called with a text for each refused or closed connection. If no
         event loop is running, a separate thread calls the function.
-    local: bus that passes messages to subscribers in this process without encoding. The socket is
-        then used only while another process has subscribed.
+    local: bus that passes messages to subscribers in this process without encoding them. The socket
+        is then used only while another process has subscribed.
     """
 
     def __init__(

@@ -10,7 +10,7 @@ from pathlib import Path
 from flexsheet.messages.errors import FlexsheetError
 
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
-"""The values of errno for errors of the disk or of its file system."""
+"""The values of errno that indicate an error of the disk or its file system."""
 
 
 class FileWriteError(FlexsheetError, OSError):

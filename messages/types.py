@@ -106,8 +106,8 @@ class Fingertip(Message):
     """The position of the fingertip at the exposure of an image pair, and its predicted path.
 
     If `valid` is false, `reason` states the cause. While `state` is "coasting", position and
-    velocity are predicted from the last valid measurement. `measured_world_m` is the triangulated
-    position from this image pair without filtering.
+    velocity are predicted from the last valid measurement. `measured_world_m` is the unfiltered
+    position that was triangulated from this image pair.
     """
 
     valid: bool
@@ -167,8 +167,8 @@ class SheetTarget(Message):
     """The target pose and velocity of the sheet at the time `valid_at_ns`.
 
     The sheet frame has its origin at the sheet's centre. The x axis points from the left to the
-    right edge, and the z axis towards the user. For another time, a node extrapolates the pose with
-    the velocity (twist), or follows `trajectory`.
+    right edge, and the z axis points towards the user. For another time, a node extrapolates the
+    pose with the velocity (twist), or follows `trajectory`.
     """
 
     phase: Phase
@@ -527,7 +527,7 @@ class ClockEcho(MessagePart):
 class ClockPing(Message):
     """A message between the clock nodes of two hosts to measure the offset between their clocks.
 
-    A round trip has four timestamps. Two of them are in an echo, and the others are the publish
+    A round trip has four timestamps. An echo contains two of them. The other two are the publish
     timestamp in the header and the time of arrival.
     """
 

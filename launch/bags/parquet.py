@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 MAX_VECTOR = 6
 ROWS_PER_GROUP = 2000
 MAX_GROUP_BYTES = 64 << 20
-"""The size (bytes) of the buffered images at which they are written as a row group of the file."""
+"""The total size (bytes) of buffered images after which a row group is written to the file."""
 
 TWIST = tuple(
     f"{kind}_{axis}_{unit}"

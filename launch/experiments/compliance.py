@@ -377,9 +377,9 @@ class ForceReference:
         """Return n times (ns) in a push, and the n ratios of the rubber's force to the force of an
         elastic sheet.
 
-        The membrane is solved at a few depths only, with the sheet's edges in the poses that they
-        have at the deepest point of the push. This is sufficient, because the ratio depends only on
-        the shape of the force curve.
+        The membrane is solved at a few depths only, with the poses of the edges at the deepest
+        point of the push. This is sufficient, because the ratio depends only on the shape of the
+        force curve.
         """
         begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
         times = np.arange(begin_ns, end_ns + 1, round(HISTORY_STEP_S * 1e9))

@@ -53,7 +53,7 @@ GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
     "stroke-30": partial(stroke.stroke_path, seconds=30.0),
     **twin_gestures.GESTURES,
 }
-"""The functions that make the finger paths of gestures, by name.
+"""The functions that make the finger paths of gestures, with the names of the gestures as keys.
 
 The gestures are the strokes of Furukawa et al. 2007, and models of human motions.
 """
@@ -112,7 +112,7 @@ class TrueFinger:
     """The true finger motion at n camera exposures.
 
     times_ns (n,): times of the exposures.
-    positions, velocities (n, 3): in m and m/s.
+    positions, velocities (n, 3): fingertip positions (m) and velocities (m/s).
     """
 
     times_ns: Times
@@ -122,9 +122,9 @@ class TrueFinger:
     def interpolate(self, times_ns: Times) -> Floats:
         """Return the finger positions (k, 3) at k other times, by cubic Hermite interpolation.
 
-        At a camera rate of 60 Hz, the interpolation error is at most 45 um in the fastest taps, 13
-        um in slower taps and 8 um otherwise. Positions in gaps between exposures, and outside the
-        recording, are NaN.
+        At a camera rate of 60 Hz, the interpolation error is at most 45 um in the fastest taps and
+        13 um in slower taps. In other motions, it is at most 8 um. Positions in gaps between
+        exposures, and outside the recording, are NaN.
         """
         zero = self.times_ns[0]
         seconds = (self.times_ns - zero) * 1e-9

@@ -99,7 +99,7 @@ def _place(scene: Scene, label: str, times_s: Floats, points: Floats) -> FingerP
 
 
 def make_tap(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path of six taps to a depth of 4 mm, with three taps per second.
+    """Return the path of a finger that taps six times to a depth of 4 mm, three times per second.
 
     The argument `depth_m` is ignored.
     """
@@ -109,17 +109,17 @@ def make_tap(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_hold(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that pushes to `depth_m`, holds still for 3 s, and lifts."""
+    """Return the path of a finger that pushes to `depth_m`, rests for 3 s, and lifts."""
     return _make_path(scene, "hold", _press(depth_m, 3.0, 0.8))
 
 
 def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that pushes to `depth_m` and withdraws as fast as a person does."""
+    """Return the path of a finger that pushes to `depth_m` and withdraws as fast as people do."""
     return _make_path(scene, "let-go", _press(depth_m, 1.5, 0.15))
 
 
 def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that strokes around the object and back.
+    """Return the path of a finger that strokes around the object and back.
 
     The depth oscillates between half of `depth_m` and `depth_m` once per second.
     """
@@ -144,7 +144,7 @@ def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_slip(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that pushes to half of `depth_m` and slides off the object's end."""
+    """Return the path of a finger that pushes to half of `depth_m` and slides off the object."""
     times, places = _press(0.5 * depth_m, 2.5, 0.8)
     points = map_to_surface(scene, places)
     ends = map_to_surface(scene, np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0]]))

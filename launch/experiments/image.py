@@ -56,7 +56,7 @@ def reach_path(
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
     """Return a finger path to a point above the cylinder.
 
-    theta_deg: angle of the point around the cylinder's axis, by which the sheet is inclined there.
+    theta_deg: angle of the point around the cylinder's axis. The sheet is inclined by this angle.
     """
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
@@ -64,10 +64,12 @@ def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
 def push_path(
     scene: Scene, depth_mm: float, *, along_mm: float = 0.0, tilt_deg: float = 0.0
 ) -> FingerPath:
-    """Return a finger path that pushes the side of the cylinder to a depth.
+    """Return the path of a finger that pushes the side of the cylinder to a depth.
 
-    along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
-    front. Raises ExperimentError if the position is outside the limits that the error text names.
+    along_mm: position along the axis, measured from the centre.
+    tilt_deg: angle around the axis, measured from the front.
+
+    Raises ExperimentError if the position is outside the limits that the error text names.
     """
     cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
@@ -118,8 +120,8 @@ PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (
 def make_push_series(along_mm: float, tilt_deg: float) -> Series:
     """Return the push experiment at a position on the side of the cylinder.
 
-    along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
-    front.
+    along_mm: position along the axis, measured from the centre.
+    tilt_deg: angle around the axis, measured from the front.
     """
     if not along_mm and not tilt_deg:
         return PUSH
@@ -239,7 +241,7 @@ def make_rows(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> list[dict[str, Any]]:
-    """Return the results of an image experiment, one row per value and correction.
+    """Return the results of an image experiment, with one row per value and correction.
 
     with_maps: whether to add mean, 95 % quantile and maximum of the errors at all visible points.
     with_eyes: whether to add the errors of both eyes and of the disparity.

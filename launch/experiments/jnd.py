@@ -10,8 +10,8 @@ with the normal distribution function Phi (Green & Swets, Signal detection theor
 rate is the fraction of trials that are answered at random. Sigma is the standard deviation of the
 perceived difference of two log stiffnesses. The bias is a preference for the second interval. It is
 added if the second interval has the stiffer object, and subtracted otherwise. The Weber fraction w
-is the increment at which 75 % of the answers would be correct if there were no lapses and no bias:
-ln(1 + w) = 0.674 sigma.
+is the increment at which 75 % of the answers would be correct if there were no lapses and no bias.
+Therefore ln(1 + w) = 0.674 sigma.
 
 Each trial uses the increment that gives the least expected entropy of the posterior of w. This is
 the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown

@@ -28,8 +28,8 @@ def estimate_lag_s(
     them at all shifts within +-max_lag_s. A parabola through the best shift and its neighbours
     refines the result. Mean and linear trend are removed from both motions, since in uniform motion
     a lag cannot be distinguished from an offset. If parts of the motion have different lags, the
-    parts with larger motion dominate. For ten seconds at 60 Hz and 0.5 mm of motion per axis, the
-    standard error is 0.6 ms with white noise of 0.1 mm, and 1.9 ms with noise of 0.3 mm.
+    parts with larger motion dominate. Example: ten seconds at 60 Hz with 0.5 mm of motion per axis.
+    The standard error is 0.6 ms with white noise of 0.1 mm, and 1.9 ms with noise of 0.3 mm.
 
     times_s: n increasing times; their differences need not be equal.
     follower, leader: positions at these times, m, with shape (n,), or (n, k) for k axes.
@@ -37,8 +37,9 @@ def estimate_lag_s(
         the range of `times_s`.
 
     Returns None if the motion is only a linear trend, the correlation is below MIN_CORRELATION, or
-    the best shift is +max_lag_s or -max_lag_s. Raises ValueError if the times are invalid, if
-    values are not finite or differ in number, or if the duration is at most four times `max_lag_s`.
+    the best shift is +max_lag_s or -max_lag_s. Raises ValueError if the times are invalid, or if
+    values are not finite or differ in number. It is also raised if the duration is at most four
+    times `max_lag_s`.
     """
     follower_rows, leader_rows = (_to_rows(values) for values in (follower, leader))
     leader_s = times_s if leader_times_s is None else leader_times_s

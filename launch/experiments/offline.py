@@ -192,7 +192,7 @@ class CrossErrors:
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return mean and maximum lengths (mm) of the errors of the eyes and of the disparity."""
+        """Return the mean and maximum lengths (mm) of the eyes' errors and the disparity error."""
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {
@@ -307,8 +307,10 @@ class OfflineEvaluator:
     def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
         """Return the contact after the sheet has rolled over the object without slip.
 
-        The sheet starts in contact with the front of the object. around_m, aside_m: arc length
-        around the object, and distance to the right, from the front to the new contact point.
+        The sheet starts in contact with the front of the object.
+
+        around_m: arc length around the object from the front to the new contact point.
+        aside_m: distance from the front to the new contact point, to the right.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))

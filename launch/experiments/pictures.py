@@ -36,7 +36,9 @@ CORRECTION_NAMES = {
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw the eye's image for each image correction, and the expected image, one row per case."""
+    """Draw the eye's image for each image correction, and the expected image, with one row per
+    case.
+    """
     columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)

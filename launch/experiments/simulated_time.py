@@ -1,10 +1,10 @@
 """Simulate tracking, planning and both arms in simulated time, without running nodes.
 
-The nodes' methods are called at the simulated times at which the nodes would call them: at the
-exposure, when the image arrives, when the sheet target takes effect, and in each arm cycle. The
-results are reproducible, and do not depend on the load of the computer. The path check before the
-first motion, the synchronization of the arms, and stops are not simulated. Images are simulated
-only on request. The soft body applies no force, so the sheet's stretch does not change.
+The nodes' methods are called at the simulated times at which the nodes would call them. These are
+the exposure, the arrival of the image, the time when the sheet target takes effect, and each arm
+cycle. The results are reproducible, and do not depend on the load of the computer. The path check
+before the first motion, the synchronization of the arms, and stops are not simulated. Images are
+simulated only on request. The soft body applies no force, so the sheet's stretch does not change.
 
 The ground truth comes from the simulator: camera, servos, flange compliance and sheet surface.
 """
@@ -269,7 +269,9 @@ class SimulatedArm:
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge uses: measured, or known in advance."""
+        """Return the servo lag (s) that the bridge uses: a measured value, or a value known in
+        advance.
+        """
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property

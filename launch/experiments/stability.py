@@ -172,7 +172,9 @@ def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Fl
 
 
 def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[dict[str, Any]]:
-    """Return the simulated and the predicted critical slopes, one row per hand and control loop."""
+    """Return the simulated and the predicted critical slopes, with one row per hand and control
+    loop.
+    """
     hands = draw_hands(settings.hands, settings.seed)
     rows: list[dict[str, Any]] = []
     for rate_hz, towards in product(settings.rates_hz, (True, False)):

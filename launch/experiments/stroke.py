@@ -86,7 +86,8 @@ ARM_EVENTS: dict[Side, LatencyEvent] = {
 class DrawnFrames:
     """The contents of the drawn frames, with the time (ns) at the centre of each frame's display.
 
-    fingertip: drawn fingertip position (3,), m. sheet: centre and normal of the sheet (6,).
+    fingertip: drawn fingertip position (3,), m.
+    sheet: centre (m) and normal of the drawn sheet, (6,).
     deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
     """
 
@@ -434,9 +435,11 @@ def compute_sheet_planes(
 def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Floats]:
     """Return the contact points D' (n, 3), in m, of a sheet on a cylinder, and their angles (n,).
 
-    Each of the n points D' is the point of the sheet's plane that is nearest to the cylinder axis
-    at x = `x_m` (n,), in the object's frame. The angle (rad) is the direction of the plane's normal
-    around the axis.
+    For each of n given positions x on the cylinder axis, D' is the point of the sheet's plane that
+    is nearest to the axis at x. The angle (rad) is the direction of the plane's normal around the
+    axis.
+
+    x_m: positions x (n,), m, in the object's frame.
     """
     normal = planes.normals
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
@@ -644,8 +647,11 @@ def compute_arcs(
 ) -> Floats:
     """Return arc lengths (n, 2), in m, around the cylinder at n times.
 
-    The first column belongs to the contact line of the sheet, the second column to `points` (n, 3),
-    m, in the world frame. edges: motions of both clamped edges.
+    The first column belongs to the contact line of the sheet. The second column belongs to
+    `points`.
+
+    edges: motions of both clamped edges.
+    points: n points (n, 3), m, in the world frame.
     """
     planes = compute_sheet_planes(edges, object_pose(scene), times_ns)
     _, angles = find_presented_points(planes, np.zeros(len(points)))

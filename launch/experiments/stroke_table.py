@@ -54,7 +54,7 @@ class Variant:
 def make_variants(
     launch_file: Path, folder: Path, *, apparatus: str | None, ablations: bool, radii: bool
 ) -> list[Variant]:
-    """Return the variants to measure; the first one is the given configuration.
+    """Return the variants to measure; the first variant is the given configuration.
 
     The files of the other variants are written to the folder.
 

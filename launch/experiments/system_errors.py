@@ -94,7 +94,7 @@ finger; true minus computed sheet.
 
 
 def make_stroke(scene: Scene, seconds: float) -> FingerPath:
-    """Return a finger path that strokes back and forth around the object.
+    """Return the path of a finger that strokes back and forth around the object.
 
     The maximum speed is the speed of the scene's working range.
 

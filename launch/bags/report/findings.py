@@ -14,7 +14,10 @@ SLOW_RATIO = 0.5
 """The fraction of a topic's minimum rate below which the rate is reported as a problem."""
 
 MAX_UNSEEN_RATIO = 0.05
-"""The maximum fraction of images without a valid fingertip that is not reported as a problem."""
+"""The limit for the fraction of images that give no valid fingertip.
+
+A larger fraction is reported as a problem.
+"""
 
 MAX_LIMIT_RATIO = 1.0
 """The maximum ratio of a value to its limit that is not reported as a problem."""
