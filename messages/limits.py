@@ -46,7 +46,7 @@ MAX_STRETCH_RATIO = 10.0
 """The maximum stretch ratio of a sheet. Natural rubber breaks at a smaller ratio."""
 
 MAX_NUMBER = 1e9
-"""The maximum magnitude of a number without a unit."""
+"""The maximum magnitude of a number that has no unit."""
 
 MAX_SEED = 2.0**63
 MAX_BYTES = 2.0**50

@@ -345,7 +345,7 @@ class NodeRun:
 
 
 def read_runs(bag: Path, name: str) -> list[NodeRun]:
-    """Read the execution logs of a node from a bag, one for each start of the node.
+    """Read the execution logs of a node from a bag, with one log for each start of the node.
 
     Return an empty list if the bag contains no log.
     """

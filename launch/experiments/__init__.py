@@ -26,7 +26,7 @@ class ExperimentError(FlexsheetError, RuntimeError):
 
 
 class OverloadedError(ExperimentError):
-    """Raised if an experiment waits too long on a computer with too few free processors."""
+    """Raised if an experiment waits too long because the computer has too few free processors."""
 
     code = "overloaded"
     remedy = (

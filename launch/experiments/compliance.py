@@ -86,7 +86,7 @@ HISTORY_CELLS = 16
 
 The force history of the rubber is computed from this curve.
 
-HISTORY_DEPTHS is the number of depths in it.
+HISTORY_DEPTHS is the number of depths in the curve.
 """
 
 
@@ -353,7 +353,7 @@ class ForceReference:
 
         left, right: poses (4, 4) of the sheet's edges.
         tip: fingertip (3,).
-        cells: membrane elements per side.
+        cells: number of membrane elements per side.
         """
         pressed = solve_sheet(
             self._scene, self._recorded.apparatus, (left, right), tip, cells=cells

@@ -49,8 +49,8 @@ of image correction that are compared.
 class DemoResult:
     """The results of all finished experiments of the demo.
 
-    strokes: one result per stroke. followed: errors of the sheet along the given finger path; None
-    if no path was given.
+    strokes: one result per stroke.
+    followed: errors of the sheet along the given finger path; None if no path was given.
     """
 
     strokes: list[dict[str, Any]] = field(default_factory=list)

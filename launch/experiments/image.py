@@ -145,7 +145,9 @@ def make_pattern_label(label: str, pattern: Pattern) -> str:
 
 
 def make_eyes_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the images that show a pattern in the case `label`, one image per eye."""
+    """Return the label of the images that show a pattern in the case `label`, with one image per
+    eye.
+    """
     return f"{make_pattern_label(label, pattern)}, both eyes"
 
 

@@ -66,7 +66,10 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -
 
 
 def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Return the bounding box (left, top, width, height) of all non-black pixels, or None."""
+    """Return the bounding box (left, top, width, height) of all non-black pixels.
+
+    Return None if all pixels are black.
+    """
     ys, xs = np.nonzero(image.max(axis=2) > MAX_BLACK)
     if len(xs) == 0:
         return None
@@ -186,7 +189,9 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_stability(result: dict[str, Any], path: Path) -> None:
-    """Draw the fraction of stable hands against stiffness and delay, one panel per control loop."""
+    """Draw the fraction of stable hands against stiffness and delay, with one panel per control
+    loop.
+    """
     rows = [*result["rows"], *result["without_bounds"]]
     kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})

@@ -84,7 +84,7 @@ An infinite bandwidth means that the depth is not filtered.
 class StabilitySettings:
     """The settings of the experiment.
 
-    hands: number of random hands per group of HAND_RANGES, sampled with `seed`.
+    hands: number of random hands in each group of HAND_RANGES, sampled with `seed`.
     delays_s, jitters_s: delays of the control loop and their jitter.
     rates_hz: camera rates at which the critical slope is measured.
     object_ratios: factors of the stiffness of the scene's object.

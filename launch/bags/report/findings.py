@@ -86,7 +86,7 @@ def _times(count: int) -> str:
 def _check_load(numbers: dict[str, Any], affected: list[str]) -> list[SessionFinding]:
     """Return one problem if any computer was overloaded, otherwise an empty list.
 
-    affected: names of the topics with lost or delayed messages.
+    affected: names of the topics whose messages were lost or delayed.
     """
     hosts = [host for host in numbers["hosts"].values() if host["busy_fraction"]]
     if not hosts:
