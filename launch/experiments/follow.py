@@ -333,9 +333,10 @@ def bound_errors(
 ) -> dict[str, Any]:
     """Return a lower bound of the contact error for a finger path, in mm.
 
-    The result contains the mean and the 95 % quantile (p95) over the time steps in which the finger
-    touches the object, for the motion with the least mean. The error is counted as zero in steps in
-    which the arms cannot reach the exact pose, and in windows that have no solution.
+    The result contains the mean and the 95 % quantile (p95) for the motion with the least mean.
+    Only time steps in which the finger touches the object are included. The error is counted as
+    zero in steps in which the arms cannot reach the exact pose, and in windows that have no
+    solution.
 
     times_s: n increasing times.
     positions_world: (n, 3), true fingertip positions, m.

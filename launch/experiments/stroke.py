@@ -435,9 +435,8 @@ def compute_sheet_planes(
 def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Floats]:
     """Return the contact points D' (n, 3), in m, of a sheet on a cylinder, and their angles (n,).
 
-    For each of n given positions x on the cylinder axis, D' is the point of the sheet's plane that
-    is nearest to the axis at x. The angle (rad) is the direction of the plane's normal around the
-    axis.
+    For each of n positions x on the cylinder axis, D' is the nearest point of the sheet's plane.
+    The angle (rad) is the direction of the plane's normal around the axis.
 
     x_m: positions x (n,), m, in the object's frame.
     """
