@@ -174,8 +174,8 @@ class FingerTruth(Part):
 
     The finger frame has its origin at the contact point of the fingertip's pad. All messages use
     this point as the position of the fingertip. The x axis points along the finger towards the
-    hand, and the z axis from the pad to the nail. The y axis is the cross product of the z axis and
-    the x axis.
+    hand, and the z axis points from the pad to the nail. The y axis is the cross product of the z
+    axis and the x axis.
     """
 
     radius_offset_m: Small = 0.0

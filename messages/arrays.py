@@ -136,7 +136,7 @@ def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinit
     """Return whether all elements of an array are finite.
 
     For an array of at most `few` elements, the function tests the sum of the elements, which is
-    faster than numpy's test. Because a sum of finite elements may overflow, numpy's test decides if
+    faster than numpy's test. Because a sum of finite elements can overflow, numpy's test decides if
     the sum is not finite.
     """
     if array.size <= few and isfinite(sum(array.ravel().tolist())):

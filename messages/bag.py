@@ -109,7 +109,7 @@ class BagWriter:
 
     All methods must be called from one thread. A separate thread flushes the file to the disk every
     second (fsync). If the process is killed, at most the last second of messages is lost. After a
-    power failure, slightly more may be lost.
+    power failure, slightly more can be lost.
 
     metadata: named tables of text that identify the recording (clock, hosts, git state).
     compress: whether to compress chunks of about 1 MiB with zstd. If chunks are not compressed,
@@ -558,7 +558,8 @@ class BagReader:
             offset += _RECORD_HEAD.size
             if first and opcode != Opcode.HEADER:
                 raise BagError(
-                    f"{self.path}: this is not a bag; its first record is not an MCAP header"
+                    f"{self.path}: its first record is not an MCAP header; "
+                    "give a bag of `flexsheet bag record`"
                 )
             try:
                 self._index_record(file, opcode, offset, length)
@@ -628,7 +629,7 @@ class BagReader:
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
         """Index the chunks that the index in a truncated bag does not cover.
 
-        The last chunk is always indexed, because the index record after it may be truncated. A
+        The last chunk is always indexed, because the index record after it can be truncated. A
         damaged chunk is reported in `problem`. Reading its messages raises an error.
         """
         for chunk in self.chunks:
@@ -718,7 +719,9 @@ class BagReader:
 
 
 def _find_type_name(channel: mcap_records.Channel) -> str:
-    """Return the current name of a channel's message type, which may have been renamed."""
+    """Return the current name of a channel's message type, which differs from the recorded name if
+    the type has been renamed.
+    """
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
 

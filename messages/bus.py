@@ -1,18 +1,19 @@
 """Publish and subscribe by ZeroMQ sockets in the asyncio event loop.
 
 A publisher binds its socket and subscribers connect to it, in any order. Publishers and subscribers
-may be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
+can be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
 calls the handler there. `benchmarks/messaging.py` compares this design with others; this design has
-the smallest latency. No `recv` is ever pending, so no cancelled `recv` can lose a message.
+the smallest latency. A subscriber never waits in a `recv` call. Therefore a message cannot be lost
+because such a call is cancelled.
 
 A subscriber has one socket per host, which identifies the host of each message. From each host, the
 subscriber accepts only messages of the nodes that run there. Sockets that other computers can reach
 always use keys (`flexsheet.messages.security`).
 
-The file descriptor of a ZeroMQ socket is edge-triggered: its signal means that the state of the
-socket has changed, not that a message is ready. Any call on the socket can clear the signal. Each
-callback therefore reads until the socket is empty, or schedules itself again. No other code uses a
-socket that is being read.
+The file descriptor of a ZeroMQ socket is edge-triggered: its signal means only that the state of
+the socket has changed. A message need not be ready. Any call on the socket can clear the signal.
+Each callback therefore reads until the socket is empty, or schedules itself again. No other code
+uses a socket that is being read.
 """
 
 from __future__ import annotations
@@ -177,8 +178,8 @@ class Publisher:
         interface.
     on_refused: function that is called with a text for each refused or closed connection. If no
         event loop is running, a separate thread calls the function.
-    local: bus that passes messages to subscribers in this process without encoding. The socket is
-        then used only while another process has subscribed.
+    local: bus that passes messages to subscribers in this process without encoding them. The socket
+        is then used only while another process has subscribed.
     """
 
     def __init__(
@@ -291,7 +292,7 @@ class Publisher:
         """Read a batch of subscriptions, and send the stored message again to new subscribers.
 
         For a topic that is not latched, the socket reports only the first subscription and the end
-        of the last one.
+        of the last subscription.
         """
         if self._socket.closed or self._loop is None:
             return
@@ -362,12 +363,12 @@ class Publisher:
 class Subscriber:
     """A subscriber of one topic, which calls `on_message(message, header)` in the event loop.
 
-    connect: endpoints of all nodes that publish the topic. A node may start after the subscriber,
-        and may restart.
+    connect: endpoints of all nodes that publish the topic. A node can start after the subscriber,
+        and can restart.
     counts: counters of superseded, lost and rejected messages.
     on_problem: function that is called with a text about a problem: the first rejection for each
-        cause, and each exception in `on_message`. Lost messages are a problem each time their
-        number has doubled, except on topics with the delivery `latest`.
+        cause, and each exception in `on_message`. Lost messages are reported each time their number
+        has doubled, except on topics with the delivery `latest`.
     on_handshake_failed: function that is called with a text for each kind of failed handshake. If
         None, `on_problem` is called.
     raw: whether `on_message(frames, header)` is called with the undecoded frames of every message.
@@ -610,7 +611,10 @@ class _Writer:
 
 
 def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
-    """Return the names of the nodes that publish at the endpoints, or None if one is unknown."""
+    """Return the names of the nodes that publish at the endpoints.
+
+    Return None if the node at one of the endpoints is unknown.
+    """
     known = [one.writer for one in sources if one.writer is not None]
     return frozenset(known) if len(known) == len(sources) > 0 else None
 
@@ -748,7 +752,7 @@ class _HostConnection:
     def _deliver_newest(self) -> bool:
         """Deliver the newest message of each node, and skip older messages without validating them.
 
-        A first message that is younger than half the period of the topic is delivered at once.
+        The first message is delivered at once if it is younger than half the period of the topic.
         Return whether the socket has no more messages.
         """
         newest: dict[str, Envelope] = {}

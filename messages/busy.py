@@ -36,7 +36,9 @@ def describe_busy_remedy(*, nice_denied: bool) -> str:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Return a sentence with the reason why a computer is overloaded, or "" if it is not."""
+    """Return a sentence with the reason why a computer is overloaded, or "" if there is no
+    overload.
+    """
     if not is_busy(host):
         return ""
     if host.cpu is None:

@@ -1,4 +1,4 @@
-"""Close tcp connections on which a peer sends a publisher more data than a subscriber sends.
+"""Close tcp connections on which a peer sends more data to a publisher than a subscriber needs to.
 
 A ZeroMQ publisher stores every subscription that a peer sends. A stored subscription needs about 45
 times as much memory as the received data. The subscriptions are stored in the call that sends the
@@ -120,7 +120,8 @@ class ConnectionGuard:
 
     @classmethod
     def watch(cls, publisher: zmq.Socket[bytes], on_refused: OnRefused) -> None:
-        """Monitor all future connections to a publisher until its socket's monitor is disabled.
+        """Monitor all future connections to a publisher, until the monitor of its socket is
+        disabled.
 
         on_refused: function that is called with the peer's address and the reason of each refusal.
         """

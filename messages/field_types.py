@@ -31,7 +31,7 @@ def describe_field(field: FieldInfo) -> dict[str, str]:
 
 
 def strip_markdown(text: str) -> str:
-    """Remove the marks of code from Markdown, and replace its links by their text."""
+    """Remove the code marks (backticks) from a Markdown text, and replace each link by its text."""
     return re.sub(r"[`\\]", "", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from flexsheet.messages.errors import FlexsheetError
 
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
-"""The values of errno for errors of the disk or of its file system."""
+"""The values of errno that indicate an error of the disk or its file system."""
 
 
 class FileWriteError(FlexsheetError, OSError):
@@ -56,8 +56,8 @@ def make_write_error(
 ) -> FileWriteError:
     """Make the error for a file that could not be written, with a remedy that fits the cause.
 
-    needed_bytes: size of the file, which the error text contains if the disk is full; None if
-        unknown.
+    needed_bytes: size of the file, which the error text contains if the disk is full; None if the
+    size is unknown.
     """
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):

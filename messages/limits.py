@@ -46,7 +46,7 @@ MAX_STRETCH_RATIO = 10.0
 """The maximum stretch ratio of a sheet. Natural rubber breaks at a smaller ratio."""
 
 MAX_NUMBER = 1e9
-"""The maximum magnitude of a number without a unit."""
+"""The maximum magnitude of a number that has no unit."""
 
 MAX_SEED = 2.0**63
 MAX_BYTES = 2.0**50
@@ -90,13 +90,13 @@ MAX_BY_UNIT = {
     "_ratio": 1e6,
     "_bytes": MAX_BYTES,
 }
-"""The maximum magnitude of a number, by the unit suffix of its field's name.
+"""The maximum magnitude of a number for each unit suffix of a field's name.
 
 If one suffix ends with another suffix, the longer suffix is listed first.
 """
 
 MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
-"""The minimum value of a positive number, by the unit suffix of its field's name.
+"""The minimum value of a positive number for each unit suffix of a field's name.
 
 The values are below the resolution of any device.
 """

@@ -3,8 +3,8 @@
 A publisher passes each message to the subscribers in its process. The socket is used only while
 another process has subscribed. A subscriber checks the same properties as for messages from
 sockets: writer, plan, order, types, shapes and ranges. Arrays of at most `INLINE_BYTES` are copied,
-because a sender may reuse their memory. Larger arrays are shared. All arrays are read-only for the
-subscribers.
+    because a sender can reuse their memory. Larger arrays are shared. All arrays are read-only for
+    the subscribers.
 
 A message handler runs in a callback of the event loop after the sender's callback, never inside
 `send`.
@@ -154,7 +154,9 @@ class LocalBus:
         self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
 
     def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
-        """Return the channel of the first endpoint that has a channel, or None if there is none."""
+        """Return the channel of the first endpoint that has a channel, or None if no endpoint has a
+        channel.
+        """
         return next((self._channels[one] for one in endpoints if one in self._channels), None)
 
 

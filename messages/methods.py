@@ -49,7 +49,8 @@ class Methods(BaseModel):
     soft_body: SoftBodyChoice | None = None
     compliance: ComplianceMode | None = Field(
         default=None,
-        description="how the sheet renders the object's force; constant_stretch: not at all",
+        description="how the sheet renders the object's force; "
+        "constant_stretch: the force is not rendered",
     )
 
 

@@ -4,10 +4,11 @@ Every bag contains the JSON Schemas of its messages. Recorded fields remain vali
 gained fields with defaults, literal values, or members of a union. `is_compatible` checks this by
 comparing the two schemas.
 
-A renamed field needs a line in `RENAMED_FIELDS`, a renamed literal value in `RENAMED_VALUES`, and a
-removed field in `REMOVED_FIELDS`. These lines apply to every recorded version of the type. Any
-other change needs a line in `MIGRATIONS`. The line contains the type, the former fingerprint
-(`flexsheet bag info --json`), and a function that converts the recorded fields to the next version.
+A renamed field needs a line in `RENAMED_FIELDS`. A renamed literal value needs a line in
+`RENAMED_VALUES`, and a removed field needs a line in `REMOVED_FIELDS`. These lines apply to every
+recorded version of the type. Any other change needs a line in `MIGRATIONS`. The line contains the
+type, the former fingerprint (`flexsheet bag info --json`), and a function that converts the
+recorded fields to the next version.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ Schema = Mapping[str, Any]
 
 
 RENAMED_TOPICS: dict[str, str] = {"moment": "bookmark"}
-"""The current names of topics that have been renamed, by former name."""
+"""The topics that have been renamed: a mapping from former names to current names."""
 
 RENAMED_TYPES: dict[str, str] = {"Moment": "Bookmark"}
-"""The current names of message types that have been renamed, by former name."""
+"""The message types that have been renamed: a mapping from former names to current names."""
 
 RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "Fingertip": {
@@ -57,7 +58,10 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
 }
-"""The current names of message fields that have been renamed, by message type and former name."""
+"""The message fields that have been renamed.
+
+For each message type, a table maps former names to current names.
+"""
 
 RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Fingertip", "reason"): {
@@ -78,10 +82,10 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     },
     ("Methods", "sheet_force"): {"cubic": "scaled", "linear": "scaled"},
 }
-"""The current names of literal values that have been renamed.
+"""The literal values of message fields that have been renamed.
 
-The key of each table is the message type and the current name of the field. The table contains the
-current values by former value.
+A key consists of the message type and the current name of the field. The table for this key maps
+former values to current values.
 """
 
 SHEET_REASONS = {
@@ -97,7 +101,7 @@ SHEET_REASONS = {
     "sheet turned too far about its normal; lift the finger": "beyond_spin",
     "hollow place: the flat sheet rests on its rim": "concave_contact",
 }
-"""The current values of `SheetTarget.reason`, by the text that old bags contain instead."""
+"""The current value of `SheetTarget.reason` for each text that old bags contain instead."""
 
 
 def _convert_sheet_reason(recorded: str) -> str:
@@ -122,7 +126,7 @@ REMOVED_FIELDS: dict[str, frozenset[str]] = {
     "FingerTruth": frozenset({"hand_damping_ns_per_m"}),
     "Methods": frozenset({"kinematics", "triangulation"}),
 }
-"""The names of message fields that have been removed, by message type."""
+"""For each message type, the names of the fields that have been removed."""
 
 _STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
 

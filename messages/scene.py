@@ -342,7 +342,7 @@ class JointChain(ArmModel):
     kind: Literal["joint_chain"] = "joint_chain"
     origins: tuple[Pose, Pose, Pose, Pose, Pose, Pose] = Field(
         description="pose of each joint's frame in the frame of the previous joint, at angle 0; "
-        "the first one in the base"
+        "the pose of the first joint is in the base frame"
     )
     axes: tuple[Vector3, Vector3, Vector3, Vector3, Vector3, Vector3] = Field(
         description="unit vector of each joint's axis in its own frame"
@@ -440,7 +440,7 @@ class ArmSpec(Part):
     """A robot arm: its model, the pose of its base, and the pose of the sheet's edge on its flange.
 
     In the sheet frame, the x axis points from the left to the right edge. The y axis points along
-    the edges, and the z axis towards the user.
+    the edges, and the z axis points towards the user.
     """
 
     model: Annotated[ClosedFormArm | JointChain, Field(discriminator="kind")] = Field(
@@ -502,8 +502,8 @@ class Lens(Part):
 class StereoCamera(Part):
     """The parameters of the stereo camera.
 
-    In each camera frame, the x axis points to the right in the image, and the y axis down. The z
-    axis is the optical axis of the camera, and points forwards.
+    In each camera frame, the x axis points to the right in the image, and the y axis points down.
+    The z axis is the optical axis of the camera, and points forwards.
     """
 
     device: str
@@ -565,7 +565,7 @@ class Finger(Part):
     """The user's finger, its marker, and the limits of its motion.
 
     The finger frame has its origin at the contact point of the fingertip's pad. The x axis points
-    along `direction_world`, the z axis out of the nail, and the y axis is horizontal. The
+    along `direction_world`, the z axis points out of the nail, and the y axis is horizontal. The
     orientation of the finger frame in the world is constant.
     """
 
@@ -677,7 +677,7 @@ class MissingPartError(FlexsheetError, ValueError):
 
 
 def require_projector(scene: Scene) -> Projector:
-    """Return the scene's projector. Raises MissingPartError if the scene has none."""
+    """Return the scene's projector. Raises MissingPartError if the scene has no projector."""
     if scene.projector is None:
         raise MissingPartError(f'scene "{scene.name}": the key `projector` is missing')
     return scene.projector

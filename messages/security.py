@@ -319,7 +319,10 @@ class ZapAuthenticator:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return a file's modification time (ns), inode and size (bytes), or None if it is missing."""
+    """Return a file's modification time (ns), inode and size (bytes).
+
+    Return None if the file is missing.
+    """
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -36,7 +36,8 @@ class Topic:
 
     rate_hz: expected minimum and maximum rate, for health checks; None if no rate is expected.
     logged: whether the topic is recorded by default.
-    many_writers: whether any number of nodes may publish the topic; if false, only one node may.
+    many_writers: whether any number of nodes may publish the topic; if false, only one node may
+        publish it.
     max_bytes: maximum size of a message, checked when it is sent and when it is received.
     open_to_tools: whether command-line tools may publish the topic; only used if `many_writers` is
         true.

@@ -106,8 +106,8 @@ class Fingertip(Message):
     """The position of the fingertip at the exposure of an image pair, and its predicted path.
 
     If `valid` is false, `reason` states the cause. While `state` is "coasting", position and
-    velocity are predicted from the last valid measurement. `measured_world_m` is the triangulated
-    position from this image pair without filtering.
+    velocity are predicted from the last valid measurement. `measured_world_m` is the unfiltered
+    position that was triangulated from this image pair.
     """
 
     valid: bool
@@ -167,8 +167,8 @@ class SheetTarget(Message):
     """The target pose and velocity of the sheet at the time `valid_at_ns`.
 
     The sheet frame has its origin at the sheet's centre. The x axis points from the left to the
-    right edge, and the z axis towards the user. For another time, a node extrapolates the pose with
-    the velocity (twist), or follows `trajectory`.
+    right edge, and the z axis points towards the user. For another time, a node extrapolates the
+    pose with the velocity (twist), or follows `trajectory`.
     """
 
     phase: Phase
@@ -450,8 +450,8 @@ class Frame(Message):
     )
     marks_finger_ratio: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks",))] = Field(
         default_factory=lambda: np.zeros(0),
-        description="displacement of the sheet at these marks, along its normal, divided by that "
-        "of the fingertip; 0 if there is no contact",
+        description="displacement of the sheet at these marks, along its normal, divided "
+        "by the displacement of the fingertip; 0 if there is no contact",
     )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, or one (mono or packed stereo)"
@@ -516,16 +516,18 @@ class ClockEcho(MessagePart):
     """A reply of a clock node to the newest ping from the clock node of another host."""
 
     clock_id: str
-    sent_ns: int = Field(ge=0, description="publish timestamp of the ping, on its own clock")
+    sent_ns: int = Field(
+        ge=0, description="publish timestamp of the ping, on the clock of its sender"
+    )
     received_ns: int = Field(
-        ge=0, description="time of its arrival, on the clock of this message's header"
+        ge=0, description="arrival time of the ping, on the clock of this message's header"
     )
 
 
 class ClockPing(Message):
     """A message between the clock nodes of two hosts to measure the offset between their clocks.
 
-    A round trip has four timestamps. Two of them are in an echo, and the others are the publish
+    A round trip has four timestamps. An echo contains two of them. The other two are the publish
     timestamp in the header and the time of arrival.
     """
 
@@ -584,7 +586,7 @@ class SelfCheck(MessagePart):
     """A comparison of a measured value with the value that a node expects."""
 
     cause: SuspectedCause
-    subject: str = Field(default="", description="device concerned, if there are several")
+    subject: str = Field(default="", description="device that was checked, if there are several")
     unit: Literal["m", "s", "px", "rad", "N/m"]
     value: Finite = Field(description="measured value, averaged over several seconds")
     expected: Finite = Field(description="value if everything is as assumed")
@@ -673,7 +675,7 @@ class ProgramCpu(MessagePart):
 class CpuPressure(MessagePart):
     """The time for which the nodes of a computer have waited for a free processor.
 
-    The time is measured over the last seconds. Nodes with a `nice` value of 10 or more are not
+    The time is measured over the last few seconds. Nodes with a `nice` value of 10 or more are not
     included.
     """
 

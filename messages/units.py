@@ -10,7 +10,7 @@ UNITS = {
     "_deg": "°", "_px": "px", "_kg": "kg", "_pa": "Pa", "_bytes": "bytes", "_ratio": "1",
     "_ms": "ms", "_mm": "mm", "_n": "N", "_m": "m", "_s": "s",
 }  # fmt: skip
-"""The units by suffix of a name.
+"""The unit of a value for each suffix of its name.
 
 If one suffix ends with another suffix, the longer suffix is listed first.
 """

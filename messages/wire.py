@@ -167,7 +167,7 @@ class Envelope:
     def open(self) -> Message:
         """Validate the fields, and return the message.
 
-        Raises WireError, which names the first invalid field.
+        Raises WireError if a field is invalid. The error text names the first invalid field.
         """
         try:
             return self.codec.validate(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped

@@ -113,7 +113,7 @@ def export(
     Topics whose message type cannot be converted to the current version are omitted. The result
     contains their names.
 
-    topics: names of the topics to export; None: all topics.
+    topics: names of the topics to export, or None for all topics.
     progress: function that is called with the duration exported so far and the total duration (s).
 
     Raises ExportError if the export fails, and BagError if the bag cannot be read.
@@ -180,8 +180,8 @@ class TopicsToExport:
 def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) -> TopicsToExport:
     """Select the topics of a bag that can be exported.
 
-    output: file to write, which must not exist; None: not checked.
-    topics: names of the requested topics; None: all topics of the bag.
+    output: file to write, which must not exist; None if no file is written.
+    topics: names of the requested topics, or None for all topics of the bag.
 
     Raises ExportError if `output` exists or if the bag does not contain a requested topic. Raises
     BagError if the bag cannot be read.

@@ -41,7 +41,7 @@ def export_ros2(
 
     output: folder to create, which will contain metadata.yaml and an MCAP file. If the name ends
         with .mcap, only the MCAP file is written, and it contains the same metadata.
-    topics: names of the flexsheet topics to convert; None: all topics.
+    topics: names of the flexsheet topics to convert, or None for all topics.
     progress: function that is called with the duration converted so far and the total duration (s).
 
     Raises ExportError or Ros2Error if the export fails, and BagError if the bag cannot be read.

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 MAX_VECTOR = 6
 ROWS_PER_GROUP = 2000
 MAX_GROUP_BYTES = 64 << 20
-"""The size (bytes) of the buffered images at which they are written as a row group of the file."""
+"""The total size (bytes) of buffered images after which a row group is written to the file."""
 
 TWIST = tuple(
     f"{kind}_{axis}_{unit}"
@@ -349,7 +349,7 @@ def write_parquet(
 
     A slash in the name of a topic becomes a dot in the name of the file.
 
-    topics: names of the topics; None: all topics.
+    topics: names of the topics, or None for all topics.
     images: whether the tables contain images.
     progress: function that is called with the duration converted so far and the total duration (s).
 

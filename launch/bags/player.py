@@ -26,7 +26,7 @@ NEVER_PLAYED = {
     "estop": "an e-stop or its reset is not repeated",
     "recording": "requests to record are not repeated",
 }
-"""The reason for each topic that is never played."""
+"""The topics that are never played, and the reason for each of these topics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ async def play(
 def latched_before(
     bag: Path, topics: Collection[str], begin_ns: int
 ) -> list[tuple[str, Message, Header, int]]:
-    """Return the last message of every latched topic that was recorded before `begin_ns`.
+    """Return, for each latched topic, the last message that was recorded before `begin_ns`.
 
     Each entry is (topic name, message, header, time of recording in ns).
     """

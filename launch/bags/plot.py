@@ -30,8 +30,8 @@ class FieldSeries:
     """The values of a message field as a function of time.
 
     name: topic and field, as "TOPIC.FIELD".
-    times_s: source times (n,) since the start of the bag.
-    values: values (n, components) of the field.
+    times_s: n source times (s) since the start of the bag.
+    values: values of the field at these times, (n, components).
     """
 
     name: str

@@ -26,7 +26,7 @@ class ExperimentError(FlexsheetError, RuntimeError):
 
 
 class OverloadedError(ExperimentError):
-    """Raised if an experiment waits too long on a computer with too few free processors."""
+    """Raised if an experiment waits too long because the computer has too few free processors."""
 
     code = "overloaded"
     remedy = (
@@ -53,7 +53,7 @@ class ArmsNotReadyError(ExperimentError):
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
     """Check names and remove duplicates; if there are no names, return all known names.
 
-    kind: noun for the names in the error text. Raises ExperimentError if a name is unknown.
+    kind: noun that the error text uses for the names. Raises ExperimentError if a name is unknown.
     """
     for name in names:
         if name not in known:
@@ -64,8 +64,8 @@ def select_names(names: Sequence[str], known: Collection[str], kind: str) -> lis
 def find_recorded(entries: Mapping[str, Entry], kind: str, label: str) -> Entry:
     """Return the entry with the given label.
 
-    entries: entries of a bag by label. kind: noun for the entry in the error text. Raises
-    ExperimentError if there is no such entry.
+    entries: entries of a bag, with labels as keys. kind: noun that the error text uses for an
+    entry. Raises ExperimentError if there is no such entry.
     """
     if label not in entries:
         labels = ", ".join(entries) or "none"

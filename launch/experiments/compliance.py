@@ -1,10 +1,11 @@
 """Compare the force of the simulated sheet on the finger with the force of the virtual object.
 
 The finger pushes at a few positions and rests at several depths. Then it moves in and out without
-stopping. The felt force is computed by the simulator's membrane model, from the true edges of the
-sheet and the true fingertip. The wanted force is read from the published force curve, at the
-finger's true depth. Errors are relative to the stored solution of an independent solver
-(`force_reference`), or to the wanted force if there is no stored solution.
+stopping. The felt force is the force of the sheet on the finger. The simulator's membrane model
+computes it from the true poses of the sheet's edges and of the fingertip. The wanted force is the
+force of the object. It is read from the published force curve, at the finger's true depth. Errors
+are relative to the stored solution of an independent solver (`force_reference`), or to the wanted
+force if there is no stored solution.
 """
 
 from __future__ import annotations
@@ -50,44 +51,48 @@ Times = NDArray[np.int64]
 POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
 """The positions at which the finger pushes, in metres.
 
-The first value is the distance along the object, the second one the arc length around the object
-from its front.
+The first value of each pair is the distance along the object. The second value is the arc length
+around the object, measured from its front.
 """
 
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.007, 0.010, 0.013, 0.016)
 """The depths at which the finger rests, in metres.
 
-Only depths below the scene's push depth are used; the push depth is always added.
+Only depths that are smaller than the scene's push depth are used; the push depth is always added.
 """
 
 HOVER_M = 0.03
 APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
-"""The duration of a rest, and the duration of its last part, in which the force is evaluated."""
+"""The duration (s) of a rest, and the time (s) at the end of each rest in which the force is
+evaluated.
+"""
 
 MEASURED_S = 0.6
-"""The duration of the last part of each rest in which the forces of a gauge are averaged."""
+"""The time (s) at the end of each rest over which the measured forces of a gauge are averaged."""
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
 
 HISTORY_STEP_S = 0.01
-"""The time step in which the force history of the rubber is computed.
+"""The time step (s) with which the force history of the rubber is computed.
 
 The finger moves 0.5 mm in a time step.
 """
 HISTORY_DEPTHS = 9
 HISTORY_CELLS = 16
-"""The number of membrane elements per side for the elastic force curve of the force history.
+"""The number of membrane elements per side in the computation of the elastic force curve.
 
-HISTORY_DEPTHS is the number of depths of the curve.
+The force history of the rubber is computed from this curve.
+
+HISTORY_DEPTHS is the number of depths in the curve.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class RestInterval:
-    """The time interval of a rest at a depth in which the force is evaluated.
+    """The time interval in which the force is evaluated while the finger rests at a depth.
 
     begin_s, end_s: times from the start of the finger path.
     """
@@ -102,10 +107,10 @@ class Press:
     """The finger path of one push.
 
     place: name of the pushed position.
-    place_m: distance along the object and arc length around it from its front.
+    place_m: distance (m) along the object, and arc length (m) around the object from its front.
     surface, normal: point (3,) and normal (3,) of the undeformed object at this position, in the
         world frame.
-    holds: evaluated rests; empty if the finger does not rest.
+    holds: evaluated intervals; empty if the finger does not rest.
     """
 
     path: FingerPath
@@ -154,7 +159,8 @@ def _make_press(
 ) -> Press:
     """Make a push at a position from times and heights of the finger.
 
-    motion: (n, 2), times (s) and heights above the surface (m). place, place_m, holds: see `Press`.
+    motion: array (n, 2) of n times (s) and heights (m) above the surface. place, place_m, holds:
+    see `Press`.
     """
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
@@ -171,8 +177,8 @@ def _make_press(
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
     """Make the procedure that pushes at all positions of the experiment.
 
-    method: least accurate table of the soft body that is accepted. Before the first push, the
-    procedure waits until the soft body uses such a table.
+    method: least accurate method whose table is accepted. Before the first push, the procedure
+    waits until the soft body uses a table that is at least as accurate.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -188,11 +194,12 @@ def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_t
 class ComplianceRecording:
     """The data of a compliance experiment, read from a bag.
 
-    windows_ns: start and end of each finger path, by label.
-    edges: true flange poses of both arms, flattened to rows (16,).
-    curves: object force against depth, arrays (m, 2), published at `curve_times_ns`.
+    windows_ns: start and end (ns) of each finger path; the keys are the labels of the paths.
+    edges: true flange poses of both arms; each pose (4, 4) is stored as 16 numbers.
+    curves: force curves published at `curve_times_ns`. A curve with m points is an array (m, 2) of
+        depths (m) and object forces (N).
     methods: the soft body's method that computed each curve.
-    forces: times (ns) and values (N) of the valid measured contact forces (k, 2).
+    forces: array (k, 2) of times (ns) and values (N) of the k valid measured contact forces.
     """
 
     scene: Scene
@@ -263,9 +270,9 @@ class ForceSample:
     depth_m: true finger depth.
     wanted_n: published force of the object.
     felt_n: force of the sheet.
-    normal_offset_m: depth of the sheet's centre below the undeformed surface.
+    normal_offset_m: depth of the sheet centre below the undeformed surface.
     method: method of the soft body.
-    reference: force of the object from an independent solver, or None.
+    reference: force of the object that an independent solver computed, or None if none is stored.
     """
 
     depth_m: float
@@ -298,7 +305,7 @@ def _relative_error(force_n: float, expected_n: float) -> float:
 
 
 class ForceReference:
-    """A model of the true forces in a recording; it uses the simulator's membrane."""
+    """A model that computes the true forces in a recording with the simulator's membrane model."""
 
     def __init__(self, recorded: ComplianceRecording) -> None:
         self._recorded = recorded
@@ -341,11 +348,12 @@ class ForceReference:
     def _solve_n(
         self, left: Floats, right: Floats, tip: Floats, press: Press, cells: int = CELLS
     ) -> float:
-        """Return the force (N) of a purely elastic sheet on the finger, along the push.
+        """Return the force (N) of a purely elastic sheet on the finger, in the direction of the
+        push.
 
         left, right: poses (4, 4) of the sheet's edges.
         tip: fingertip (3,).
-        cells: membrane elements per side.
+        cells: number of membrane elements per side.
         """
         pressed = solve_sheet(
             self._scene, self._recorded.apparatus, (left, right), tip, cells=cells
@@ -366,11 +374,12 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return times (n,), ns, and the ratios (n,) of the rubber's force to an elastic force in a
-        push.
+        """Return n times (ns) in a push, and the n ratios of the rubber's force to the force of an
+        elastic sheet.
 
-        The membrane is solved at a few depths only, with the edges at the deepest point of the
-        push. This is sufficient, because the ratio depends only on the shape of the force curve.
+        The membrane is solved at a few depths only, with the poses of the edges at the deepest
+        point of the push. This is sufficient, because the ratio depends only on the shape of the
+        force curve.
         """
         begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
         times = np.arange(begin_ns, end_ns + 1, round(HISTORY_STEP_S * 1e9))
@@ -464,7 +473,7 @@ def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | Non
 
     The averaging interval is longer than the interval for the true force, because gauges are slow.
 
-    forces: (k, 2), times (ns) and forces (N).
+    forces: array (k, 2) of k times (ns) and forces (N).
     begin_ns: start of the finger path.
     """
     since_s = 1e-9 * (forces[:, 0] - begin_ns)

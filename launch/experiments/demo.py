@@ -29,7 +29,8 @@ from flexsheet.messages.types import Correction, FingerPath
 METRES_PER_PX = 0.0007
 """The image resolution in Furukawa et al. 2007.
 
-It is sufficient for figures, and images take a quarter of the time of the default resolution.
+It is sufficient for figures. An image takes a quarter of the time that the default resolution
+needs.
 """
 
 SECONDS = (10.0, 30.0)
@@ -37,16 +38,19 @@ IMAGES: tuple[tuple[image.Series, float, tuple[Correction, ...]], ...] = (
     (image.TILT, -40, ("none", "one_plane", "two_pass")),
     (image.PUSH, 30, ("none", "four_triangles", "two_pass")),
 )
-"""The image experiments: the varied quantity, its value (tilt in degrees, depth in mm), and the
-methods of image correction that are compared."""
+"""The image experiments.
+
+Each entry contains the varied quantity, its value (tilt in degrees, depth in mm), and the methods
+of image correction that are compared.
+"""
 
 
 @dataclass(slots=True)
 class DemoResult:
-    """The results of the experiments of the demo that are finished.
+    """The results of all finished experiments of the demo.
 
-    strokes: one result per stroke. followed: errors of the sheet along the given finger path; None
-    if no path was given.
+    strokes: one result per stroke.
+    followed: errors of the sheet along the given finger path; None if no path was given.
     """
 
     strokes: list[dict[str, Any]] = field(default_factory=list)
@@ -70,8 +74,8 @@ def run_demo(
     """Run the demo on a graph, and report the result of each experiment when it is finished.
 
     The finger makes strokes of 10 s and 30 s, or follows `path`. Images of a tilted and of a pushed
-    sheet are captured. Results and figures are written to the folder of the bag. `report` receives
-    the results that are new.
+    sheet are captured. Results and figures are written to the folder of the bag. The function
+    `report` receives the new results.
     """
     procedure = chain_procedures(*make_demo_procedures(bag, progress, report, path))
     coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
@@ -150,7 +154,7 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
 def evaluate_images(bag: Path, count: int) -> DemoResult | None:
     """Draw the images of the simulated eye in the first `count` cases of IMAGES.
 
-    Returns None if the bag does not yet contain all of them.
+    Returns None if the bag does not yet contain the images of all these cases.
     """
     images, rows = image.read_images(bag), []
     for series, value, corrections in IMAGES[:count]:

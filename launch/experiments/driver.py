@@ -70,9 +70,9 @@ SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 EYE_PIXELS_EVERY = 9
-"""The interval, in frames, between frames that contain pixels.
+"""The number of frames from one frame that contains pixels to the next such frame.
 
-The interval is odd, so that such frames alternate between both eyes.
+The number is odd, so that frames with pixels alternate between both eyes.
 """
 WAIT_S = 20.0
 FRAME_WAIT_S = 20.0
@@ -99,7 +99,7 @@ class Waiter:
 
     seconds: time (s) to wait after the start, and after each frame that postpones the deadline.
     latest_s: latest deadline, in the time of the event loop.
-    frames: number of frames that may still postpone the deadline.
+    frames: number of frames that can still postpone the deadline.
     """
 
     condition: Callable[[], bool]
@@ -131,7 +131,8 @@ class Driver:
         """Store the arguments; `async with` connects the driver to the graph.
 
         pids: function that returns the process id of each running node, for measurements.
-        publish_scene: function that replaces the scene and returns its source timestamp.
+        publish_scene: function that publishes a new scene, and returns the source timestamp of the
+            scene.
         """
         self._plan, self._run, self.pids = plan, run, pids
         self._publish_scene = publish_scene
@@ -218,10 +219,13 @@ class Driver:
     ) -> None:
         """Wait until `condition` returns True; it is evaluated when a message arrives.
 
-        description: text for the error. seconds: time to wait. max_frames: number of frames of the
-        renderer after each of which the time begins again, up to `max_seconds` in total.
+        description: name of the condition in the error text.
+        seconds: time to wait.
+        max_frames: number of renderer frames that restart the wait.
+        max_seconds: limit of the total time.
 
-        Raises `error` after this time; OverloadedError if a computer is overloaded.
+        Raises `error` if the condition is not met in time, or OverloadedError if a computer is
+        overloaded.
         """
         if condition():
             return
@@ -267,7 +271,7 @@ class Driver:
         """Wait until both arms are in mode "follow".
 
         If a node of the graph publishes soft bodies, also wait for the first soft body. Raises
-        ArmsNotReadyError after three times `WAIT_S`.
+        ArmsNotReadyError if the wait takes longer than three times `WAIT_S`.
         """
         needs_body = bool(self._plan.writers.get("soft_body"))
 
@@ -290,7 +294,8 @@ class Driver:
 
         progress: function that receives the node's progress and remaining time.
 
-        Raises ExperimentError after `MAX_TABLE_WAIT_S`, and if the table cannot be computed.
+        Raises ExperimentError if the wait takes longer than `MAX_TABLE_WAIT_S`, or if the table
+        cannot be computed.
         """
         solvers = {name: p for name, p in self._solvers() if _computes_table(p, scene)}
         if not solvers:

@@ -1,12 +1,12 @@
 """Simulate a sheet that follows a recorded finger, and compute a lower bound for its error.
 
-The bound is the optimum of a linear program over the whole recording, with the limits of the same
-arms. The linear program makes these assumptions:
+The bound is the optimum of a linear program over the whole recording, for the same arms and their
+limits. The linear program makes these assumptions:
 
 - The future of the finger is known. Therefore delays, tracking and prediction cause no error.
 - The sheet rolls on the undeformed object without slip, with a constant stretch.
 - Joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
-    limited as in the arm bridges. There is no servo lag and no limit of the jerk.
+    limited as in the arm bridges. There is no servo lag and no limit on the jerk.
 - While there is no contact, the sheet can move freely.
 - Joint angles change linearly with small deviations of the contact point.
 
@@ -82,7 +82,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
 SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
-"""The unit vectors (7, 3) along which the tool speed is limited in both directions."""
+"""The 7 unit vectors along which the tool speed is limited, both forwards and backwards."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def find_least_deviation(
     Return the lengths (n,) of the deviations; their weighted mean is a lower bound. Return None if
     no motion fulfils the limits.
 
-    weights: (n,), weights of the time steps.
+    weights: (n,), weights of the n time steps.
     step_s: time step.
     max_deviation: limit of each component of a deviation.
     """
@@ -173,12 +173,15 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the sparse matrix (steps - order, steps) that computes finite differences in time."""
+    """Return the sparse matrix (steps - order, steps) that computes finite differences in time.
+
+    steps: number of time steps. order: order of the differences.
+    """
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 
 def _block_rows(rows: Floats) -> csr_array:
-    """Return the block-diagonal matrix (n, n k) whose blocks are the rows (n, k)."""
+    """Return the block-diagonal matrix (n, n k) whose n blocks are the given rows of k numbers."""
     steps, width = rows.shape
     columns = np.arange(steps * width)
     owners = np.repeat(np.arange(steps), width)
@@ -198,7 +201,7 @@ class RolledSheet:
     on_sheet_m: Floats
 
     def pose(self, lifted_m: float = 0.0) -> Floats:
-        """Return the pose object_from_sheet (4, 4) after a shift `lifted_m` along the normal."""
+        """Return the pose object_from_sheet (4, 4) after a shift by `lifted_m` along the normal."""
         contact = self.on_sheet_m - np.array([0.0, 0.0, lifted_m])
         return transform(self.rotation, self.point - self.rotation @ contact)
 
@@ -230,14 +233,14 @@ class FollowedContact:
         self._distance_m = scene.sheet.width_m * 0.5 * (low + high)
 
     def contact_heights_m(self, positions_world: Floats) -> Floats:
-        """Return the heights (n,), m, of fingertips (n, 3) above the undeformed object."""
+        """Return the heights (n,), m, of n fingertips (n, 3) above the undeformed object."""
         local = apply(inverse(self._world_from_object), positions_world)
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
         """Return the sheets after rolling over the object to each finger position.
 
-        positions_world: (n, 3), m. The sheet starts at the front of the object.
+        positions_world: n finger positions (n, 3), m. The sheet starts at the front of the object.
         """
         object_from_world = inverse(self._world_from_object)
         front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))
@@ -330,12 +333,13 @@ def bound_errors(
 ) -> dict[str, Any]:
     """Return a lower bound of the contact error for a finger path, in mm.
 
-    The result contains the mean and the 95 % quantile (p95) over the steps in contact, for the
-    motion with the least mean. Steps whose exact sheet is out of reach, and windows without a
-    solution, count as zero.
+    The result contains the mean and the 95 % quantile (p95) for the motion with the least mean.
+    Only time steps in which the finger touches the object are included. The error is counted as
+    zero in steps in which the arms cannot reach the exact pose, and in windows that have no
+    solution.
 
-    times_s: (n,), increasing.
-    positions_world: (n, 3), true fingertip, m.
+    times_s: n increasing times.
+    positions_world: (n, 3), true fingertip positions, m.
 
     Raises ExperimentError if the path never touches the object.
     """
@@ -383,7 +387,7 @@ def bound_errors(
 def _windows(reachable: Bools) -> list[slice]:
     """Divide the reachable time steps into windows of 3 to WINDOW_STEPS consecutive steps.
 
-    reachable: (n,), whether the arms reach the sheet in each time step.
+    reachable: whether the arms reach the sheet in each of the n time steps, (n,).
     """
     changes = np.flatnonzero(np.diff(reachable.astype(int))) + 1
     ends = [0, *changes.tolist(), len(reachable)]
@@ -406,7 +410,8 @@ def run_follow(
 ) -> dict[str, Any]:
     """Let the sheet follow a finger path, and return the results of `experiment follow --json`.
 
-    bag: file in which the running graph is recorded; None to follow the path in simulated time.
+    bag: file in which the running graph is recorded. If it is None, no graph is run, and the path
+    is followed in simulated time.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()

@@ -46,7 +46,11 @@ class ReferenceForceCurve:
         self._uncertainty = np.array(curve["uncertainty_ratio"])
 
     def force(self, depth_m: float) -> ReferenceForce | None:
-        """Return the force at a depth; None if the depth is outside the curve by more than 1 %."""
+        """Return the force at a depth, or None if the depth is outside the depth range of the
+        curve.
+
+        A depth is accepted if it exceeds a limit of the range by at most 1 % of the limit.
+        """
         if not 0.99 * self._depths_m[0] <= depth_m <= 1.01 * self._depths_m[-1]:
             return None
         return ReferenceForce(

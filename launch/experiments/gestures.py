@@ -53,7 +53,7 @@ GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
     "stroke-30": partial(stroke.stroke_path, seconds=30.0),
     **twin_gestures.GESTURES,
 }
-"""The functions that make the finger paths of gestures, by name.
+"""The functions that make the finger paths of gestures, with the names of the gestures as keys.
 
 The gestures are the strokes of Furukawa et al. 2007, and models of human motions.
 """
@@ -80,7 +80,9 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
     """
     scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:
-        raise ExperimentError(f'{launch_file}: missing key "scene", which a finger path requires')
+        raise ExperimentError(
+            f'{launch_file}: missing key "scene", which a finger path requires; add the key'
+        )
     if name_or_file in GESTURES:
         return gesture_path(name_or_file, scene)
     file = Path(name_or_file)
@@ -107,9 +109,10 @@ def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedu
 
 @dataclass(frozen=True, slots=True)
 class TrueFinger:
-    """The true finger motion at the exposures.
+    """The true finger motion at n camera exposures.
 
-    times_ns (n,): times. positions, velocities (n, 3): in m and m/s.
+    times_ns (n,): times of the exposures.
+    positions, velocities (n, 3): fingertip positions (m) and velocities (m/s).
     """
 
     times_ns: Times
@@ -117,10 +120,11 @@ class TrueFinger:
     velocities: Floats
 
     def interpolate(self, times_ns: Times) -> Floats:
-        """Return the finger positions (m, 3) at other times (m,), by cubic Hermite interpolation.
+        """Return the finger positions (k, 3) at k other times, by cubic Hermite interpolation.
 
-        At 60 Hz the interpolation error is at most 45 um in the fastest taps, 13 um in slower taps
-        and 8 um otherwise. Positions in gaps between exposures, and outside the recording, are NaN.
+        At a camera rate of 60 Hz, the interpolation error is at most 45 um in the fastest taps and
+        13 um in slower taps. In other motions, it is at most 8 um. Positions in gaps between
+        exposures, and outside the recording, are NaN.
         """
         zero = self.times_ns[0]
         seconds = (self.times_ns - zero) * 1e-9
@@ -139,7 +143,8 @@ class TrueFinger:
 class GestureRecording:
     """The data of recorded gestures, read from a bag; all times are in ns on the same clock.
 
-    truth: true finger motion. fingertips: messages measured at the exposures `times_ns`.
+    truth: true finger motion. fingertips: fingertip messages that were measured at the exposures
+        `times_ns`.
     windows_ns: start and end of each gesture.
     """
 
@@ -193,9 +198,9 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
     """Return the jumps (n-1,) between consecutive position estimates, in standard deviations.
 
     A jump is the difference of two errors, so it does not contain the finger's motion. The standard
-    deviation is taken along the jump, for independent estimates.
+    deviation is taken along the jump; the estimates are assumed to be independent.
 
-    errors: (n, 3), errors of the estimates, m.
+    errors: (n, 3), errors of the n estimates, m.
     covariances: (n, 3, 3), covariances of the estimates, m^2.
     """
     jumps = np.diff(errors, axis=0)
@@ -207,7 +212,7 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
 
 
 def error_mm(errors: Floats) -> dict[str, float | None]:
-    """Return rms, 99 % quantile and maximum (mm) of the lengths of errors (n, 3) in m.
+    """Return rms, 99 % quantile and maximum (mm) of the lengths of n error vectors (n, 3) in m.
 
     All values are None if there are no errors.
     """
@@ -237,15 +242,15 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
 
 
 def _stack_rows(points: Sequence[Floats]) -> Floats:
-    """Stack points (3,) as rows of an array (n, 3); return shape (0, 3) if there are none."""
+    """Stack n points (3,) as rows of an array (n, 3); n can be 0."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 
 def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
-    """Return the tracking errors (mm) and delays (ms) of one gesture; unknown values are None.
+    """Return the tracking errors (mm) and delays (ms) in one gesture; unknown values are None.
 
-    missing: number of exposures without a fingertip.
-    reasons: number of invalid fingertips, by reason.
+    missing: number of exposures for which no fingertip was published.
+    reasons: number of invalid fingertips for each reason.
     jump: jumps between consecutive valid fingertips, see `jump_sigmas`.
     """
     begin_ns, end_ns = find_recorded(recorded.windows_ns, "gesture", name)

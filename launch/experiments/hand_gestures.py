@@ -1,8 +1,8 @@
 """Evaluate the force that a simulated hand feels: `experiment stability --gestures`.
 
-The gestures are voluntary motions of a simulated hand, from which the force of the sheet deflects
-the finger. The force of the sheet is compared with the force of the virtual object at the finger's
-true depth. The simulation runs in simulated time.
+The gestures are voluntary motions of a simulated hand. The force of the sheet deflects the finger
+from these motions. The force of the sheet is compared with the force of the virtual object at the
+finger's true depth. The simulation runs in simulated time.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ It is a tenth of the smallest force that a fingertip can perceive.
 def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:
     """Return the finger motion of a push, a rest and a release.
 
-    Returns times (n,), s, and surface positions (n, 3), m.
+    Returns n times (s) and n positions (n, 3), m, relative to the object's surface.
 
     hold_s, lift_s: durations of the rest and of the release.
     """
@@ -99,24 +99,27 @@ def _place(scene: Scene, label: str, times_s: Floats, points: Floats) -> FingerP
 
 
 def make_tap(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path of six taps to a depth of 4 mm, three per second; ignore `depth_m`."""
+    """Return the path of a finger that taps six times to a depth of 4 mm, three times per second.
+
+    The argument `depth_m` is ignored.
+    """
     above, below = (0.0, 0.0, TAP_LIFT_M), (0.0, 0.0, -TAP_M)
     moves = [move for _ in range(TAPS) for move in ((0.11, below), (0.06, below), (0.16, above))]
     return _make_path(scene, "tap", minimum_jerk(above, moves))
 
 
 def make_hold(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that pushes to `depth_m`, holds still for 3 s, and lifts."""
+    """Return the path of a finger that pushes to `depth_m`, rests for 3 s, and lifts."""
     return _make_path(scene, "hold", _press(depth_m, 3.0, 0.8))
 
 
 def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that pushes to `depth_m` and withdraws as fast as a person does."""
+    """Return the path of a finger that pushes to `depth_m` and withdraws as fast as people do."""
     return _make_path(scene, "let-go", _press(depth_m, 1.5, 0.15))
 
 
 def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that strokes around the object and back.
+    """Return the path of a finger that strokes around the object and back.
 
     The depth oscillates between half of `depth_m` and `depth_m` once per second.
     """
@@ -141,7 +144,7 @@ def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_slip(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that pushes to half of `depth_m` and slides off the object's end."""
+    """Return the path of a finger that pushes to half of `depth_m` and slides off the object."""
     times, places = _press(0.5 * depth_m, 2.5, 0.8)
     points = map_to_surface(scene, places)
     ends = map_to_surface(scene, np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0]]))
@@ -162,15 +165,15 @@ HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
     "let-go": (make_let_go, 1),
     "slip": (make_slip, 1),
 }
-"""The function that makes the finger path, and the number of touches, of each gesture by name."""
+"""For each gesture, the function that makes the finger path, and the number of touches."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeltForce:
     """The felt force and the object's force at the finger's depth.
 
-    times_s, depths_m, felt_n, wanted_n: arrays (n,) with one element per time step. wanted_n: force
-        of the object.
+    times_s, depths_m, felt_n, wanted_n: arrays with one element per time step. `wanted_n` is the
+    force of the object.
     """
 
     times_s: Floats
@@ -182,7 +185,7 @@ class FeltForce:
 def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) -> FeltForce:
     """Compute the felt force and the object's force during a recorded touch.
 
-    curve: (m, 2), depths (m) and forces (N) of the object.
+    curve: (n, 2), n pairs of depth (m) and force (N) of the object.
     """
     shape = make_shape(dict(scene.object.geometry))
     points = apply(inverse(object_pose(scene)), recorded.positions_m)
@@ -249,7 +252,7 @@ def hand_gestures_result(
     The keys of the forces are (kind of hand, gesture).
 
     hands: number of hands of each kind (finger, wrist, arm).
-    curve: (m, 2), depths (m) and forces (N) of the object.
+    curve: (n, 2), n pairs of depth (m) and force (N) of the object.
     """
     progress("computing the reaction of the sheet (only once)")
     reaction = load_or_compute_reaction(scene, None)
@@ -293,7 +296,7 @@ def run_gestures(
     The results have the format of `hand_gestures_result`. The force is sampled only at the camera's
     exposures, so shorter peaks are missed.
 
-    curve: (m, 2), depths (m) and forces (N) of the object.
+    curve: (n, 2), n pairs of depth (m) and force (N) of the object.
     apparatus: file with the true parameters of the simulated hardware and of the hand.
     """
     coupled = [*settings, *make_settings(launch_file, "twin_finger", "hand=coupled")]
@@ -353,7 +356,7 @@ def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> 
 
 
 def read_touches(bag: Path) -> dict[str, TouchRecording]:
-    """Read the touches of a simulated hand from a bag; return them by label of the path."""
+    """Read the touches of a simulated hand from a bag; the keys are labels of finger paths."""
     fingers: dict[int, TwinFinger] = {}
     phases: dict[int, Phase] = {}
     valid_at: list[int] = []

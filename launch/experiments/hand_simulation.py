@@ -44,13 +44,13 @@ ENERGY_FRACTION = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Cases:
-    """The hands and control loops that are simulated together; each field has shape (n,).
+    """The n hands and control loops that are simulated together; each field has shape (n,).
 
     delay_s: time from exposure to the sheet's motion.
     jitter_s: maximum additional delay of a measurement, uniformly distributed. A measurement is
         lost if a newer measurement overtakes it.
     depth_m: finger depth at equilibrium.
-    gain: factor of the sheet's motion around equilibrium.
+    gain: factor by which the sheet's motion around the equilibrium is multiplied.
     bandwidth_rad_per_s: natural frequency of the filter of the measured depth; infinite if there is
         no filter.
     lead_s: time by which the filtered depth is extrapolated.
@@ -88,13 +88,13 @@ class Motion:
 
     @property
     def decays(self) -> NDArray[np.bool_]:
-        """Return a mask (n,) that is True for the cases in which no oscillation is sustained."""
+        """Return a mask that is True for the cases in which no oscillation is sustained."""
         died_out = self.amplitude_m <= MAX_AMPLITUDE_M
         return np.asarray(died_out | (self.decay_per_s >= SLOWEST_DECAY_PER_S))
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Return a mask (n,) that is True for stable cases.
+        """Return a mask that is True for the stable cases.
 
         A case is stable if its oscillation decays and the sheet delivers no energy.
         """
@@ -102,7 +102,7 @@ class Motion:
 
 
 class HeldOffset:
-    """A control loop with filter and delay that computes the sheet's offset from finger depths.
+    """A control loop with a filter and a delay that computes the sheet's offset from finger depths.
 
     Until the next offset takes effect, the sheet continues to move at its last rate, as the real
     arms do.
@@ -136,7 +136,8 @@ class HeldOffset:
         self._columns = np.arange(len(cases))
 
     def sample(self, step: int, depths_m: Floats) -> None:
-        """Measure the finger depths (n,), in m, and queue the sheet offsets computed from them.
+        """Measure the finger depths (n,), in m, of the n cases, and queue the sheet offsets
+        computed from them.
 
         step: number of the time step.
         """
@@ -156,7 +157,7 @@ class HeldOffset:
         self._queued[rows, 1, self._columns] = rate
 
     def advance(self, step: int) -> Floats:
-        """Return the sheet's offsets (n,), in m, at a time step.
+        """Return the sheet's offsets (n,), in m, of the n cases at a time step.
 
         Call the method for all time steps in increasing order.
         """

@@ -1,9 +1,9 @@
 """Measure the size errors of the image on an inclined sheet and on a pushed sheet.
 
 These are the experiments of Furukawa et al. 2007, section VI, Figs. 11 and 13. A correction is a
-method that corrects the image for the sheet's shape. A case is a pair of an angle or depth, and a
-correction. Its label is stored in the renderer's frames and in the simulated eye's images. The
-results are computed from the eye's images in the bag.
+method that corrects the image for the sheet's shape. A case combines an angle or a depth with a
+correction. The label of the case is stored in the renderer's frames and in the simulated eye's
+images. The results are computed from the eye's images in the bag.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def reach_path(
 ) -> FingerPath:
     """Return a finger path through points near the cylinder.
 
-    points: angle around the cylinder (rad) and height above its surface (m). along_m: position
-    along the cylinder's axis, from its centre.
+    points: angle (rad) around the cylinder and height (m) above its surface, for each point.
+    along_m: position along the cylinder's axis, from its centre.
     """
     radius = require_cylinder(scene).radius_m
     local = [
@@ -54,23 +54,29 @@ def reach_path(
 
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
-    """Return a finger path to a point above the cylinder where the sheet is inclined."""
+    """Return a finger path to a point above the cylinder.
+
+    theta_deg: angle of the point around the cylinder's axis. The sheet is inclined by this angle.
+    """
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
 def push_path(
     scene: Scene, depth_mm: float, *, along_mm: float = 0.0, tilt_deg: float = 0.0
 ) -> FingerPath:
-    """Return a finger path that pushes the side of the cylinder to a depth.
+    """Return the path of a finger that pushes the side of the cylinder to a depth.
 
-    along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
-    front. Raises ExperimentError if the position is outside the limits.
+    along_mm: position along the axis, measured from the centre.
+    tilt_deg: angle around the axis, measured from the front.
+
+    Raises ExperimentError if the position is outside the limits that the error text names.
     """
     cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
         raise ExperimentError(
             f"--at {along_mm:g} mm, --tilt {tilt_deg:g}°: the limits on the cylinder's side are "
-            f"±{500.0 * cylinder.length_m:g} mm and ±60° from the centre of its front"
+            f"±{500.0 * cylinder.length_m:g} mm and ±60° from the centre of its front; "
+            "give smaller values"
         )
     label, angle = f"push {depth_mm:g} mm", float(np.radians(tilt_deg))
     points = [(angle, HOVER_M), (angle, -depth_mm * 1e-3)]
@@ -82,7 +88,7 @@ class Series:
     """An image experiment in which one quantity varies.
 
     key: result column of the quantity.
-    name: format string of a case's name with the value.
+    name: format string that makes the name of a case from the value.
     path: function that makes the finger path for a value.
     sizes: function that measures sizes (m) of the cylinder in an image.
     size_names: symbols of the sizes in the paper.
@@ -114,8 +120,8 @@ PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (
 def make_push_series(along_mm: float, tilt_deg: float) -> Series:
     """Return the push experiment at a position on the side of the cylinder.
 
-    along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
-    front.
+    along_mm: position along the axis, measured from the centre.
+    tilt_deg: angle around the axis, measured from the front.
     """
     if not along_mm and not tilt_deg:
         return PUSH
@@ -139,7 +145,9 @@ def make_pattern_label(label: str, pattern: Pattern) -> str:
 
 
 def make_eyes_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the images that show a pattern in the case `label`, one image per eye."""
+    """Return the label of the images that show a pattern in the case `label`, with one image per
+    eye.
+    """
     return f"{make_pattern_label(label, pattern)}, both eyes"
 
 
@@ -235,10 +243,10 @@ def make_rows(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> list[dict[str, Any]]:
-    """Return the results of an image experiment, one row per value and correction.
+    """Return the results of an image experiment, with one row per value and correction.
 
-    with_maps: add mean, 95 % quantile and maximum of the errors at all visible points. with_eyes:
-    add the errors of both eyes and of the disparity.
+    with_maps: whether to add mean, 95 % quantile and maximum of the errors at all visible points.
+    with_eyes: whether to add the errors of both eyes and of the disparity.
     """
     result = []
     for value in series.values:
@@ -260,7 +268,7 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum size error (mm) by correction method."""
+    """Return the mean and the maximum size error (mm) of each correction method."""
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),

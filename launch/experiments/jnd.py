@@ -6,17 +6,20 @@ answer is
 
     p(d) = lapse / 2 + (1 - lapse) * Phi(ln(1 + d) / sigma +- bias),
 
-with the normal distribution function Phi (Green & Swets, Signal detection theory, 1966). The bias
-is a preference for the second interval. It is added if the second interval has the stiffer object,
-and subtracted otherwise. The Weber fraction w is the increment of 75 % correct answers without
-lapses and bias: ln(1 + w) = 0.674 sigma.
+with the normal distribution function Phi (Green & Swets, Signal detection theory, 1966). The lapse
+rate is the fraction of trials that are answered at random. Sigma is the standard deviation of the
+perceived difference of two log stiffnesses. The bias is a preference for the second interval. It is
+added if the second interval has the stiffer object, and subtracted otherwise. The Weber fraction w
+is the increment at which 75 % of the answers would be correct if there were no lapses and no bias.
+Therefore ln(1 + w) = 0.674 sigma.
 
-For each trial, the increment is selected that gives the least expected entropy of the posterior of
-w. This is the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the
-unknown lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w
-falls with the square root of the number of trials; `docs/jnd.md` states the measured error.
+Each trial uses the increment that gives the least expected entropy of the posterior of w. This is
+the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown
+lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w falls
+with the square root of the number of trials; `docs/jnd.md` states the measured error.
 
-The CSV file is the only state of a session. After an interruption, all stored answers are replayed.
+The trials are stored in a CSV file, which is the only state of a session. After an interruption,
+all stored answers are replayed.
 """
 
 from __future__ import annotations
@@ -38,7 +41,9 @@ from flexsheet.messages.files import make_write_error
 from flexsheet.nodes.arrays import Floats
 
 CRITERION = 0.75
-"""The fraction of correct answers, without lapses, if the increment equals the Weber fraction."""
+"""The fraction of correct answers if the increment equals the Weber fraction and there are no
+lapses.
+"""
 
 INCREMENTS = np.geomspace(0.02, 1.0, 25)
 WEBER_FRACTIONS = np.geomspace(0.02, 1.0, 81)
@@ -54,7 +59,7 @@ Sigma is the standard deviation of the perceived difference of two log stiffness
 """
 
 CATCH_PERIOD = 20
-"""The period, in trials, with which the largest increment is used to detect inattention."""
+"""The number of trials after which the largest increment is used again, to detect inattention."""
 
 INTERVAL_QUANTILES = (0.025, 0.975)
 
@@ -87,9 +92,10 @@ class StaircaseEstimator:
         self._posterior /= self._posterior.sum()
 
     def choose(self, stiffer: int) -> int:
-        """Return the index of the increment with the most information about the Weber fraction.
+        """Return the index of the increment that gives the most information about the Weber
+        fraction.
 
-        This increment has the least expected entropy of the posterior after the answer.
+        With this increment, the posterior after the answer has the least expected entropy.
 
         stiffer: interval (1 or 2) that contains the stiffer object.
         """
@@ -121,7 +127,7 @@ class StaircaseEstimator:
 
 
 def _expected_entropy(joint: Floats) -> Floats:
-    """Return the entropy of the normalized rows of an array (n, m), multiplied by the row sums."""
+    """Return the entropy of each normalized row of a matrix, multiplied by the sum of the row."""
     total = joint.sum(axis=1, keepdims=True)
     inner = np.log(np.maximum(joint, 1e-300)) - np.log(np.maximum(total, 1e-300))
     return np.asarray(-(joint * inner).sum(axis=1))
@@ -131,7 +137,7 @@ def _expected_entropy(joint: Floats) -> Floats:
 class SessionPlan:
     """The settings of a session. An interrupted session must continue with the same settings.
 
-    participant: random code, not a name.
+    participant: random code that identifies the participant, not a name.
     scene: name and hash of the scene's geometry.
     reference_pa: Young's modulus of the reference object.
     """
@@ -167,8 +173,8 @@ class PairAnswer:
 
     stiffer: interval that the participant named, 1 or 2.
     response_s: time from the end of the second interval to the answer.
-    depths_m, forces_n: maximum push depth and maximum measured force in each interval; None if it
-        was not measured.
+    depths_m, forces_n: maximum push depth and maximum measured force in each interval; None if
+        there is no measurement.
     """
 
     stiffer: int
@@ -284,7 +290,9 @@ class StaircaseSession:
         try:
             lines = list(csv.reader(io.StringIO(whole.decode())))
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ExperimentError(f"{self.file}: is not a CSV file of a session: {error}") from None
+            raise ExperimentError(
+                f"{self.file}: is not a CSV file of a session: {error}; give another folder"
+            ) from None
         if lines and tuple(lines[0]) != COLUMNS:
             raise ExperimentError(
                 f"{self.file}:1: the file has other columns than a session; give another folder"

@@ -59,7 +59,8 @@ class PairPresenter:
         driver.on_message = self._peaks.update
 
     async def present(self, trial: PairTrial) -> PairAnswer:
-        """Present both objects of a trial in turn, and return the answer that the operator types.
+        """Present the objects of a trial one after the other, and return the answer that the
+        operator types.
 
         Raises ExperimentError if the operator types "q".
         """

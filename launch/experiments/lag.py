@@ -27,18 +27,19 @@ def estimate_lag_s(
     a cubic spline and shifted. Samples of the follower are omitted if the leader does not cover
     them at all shifts within +-max_lag_s. A parabola through the best shift and its neighbours
     refines the result. Mean and linear trend are removed from both motions, since in uniform motion
-    a lag cannot be distinguished from an offset. If slow and fast parts have different lags, larger
-    motions dominate. For ten seconds at 60 Hz and 0.5 mm of motion per axis, the standard error is
-    0.6 ms with white noise of 0.1 mm, and 1.9 ms with noise of 0.3 mm.
+    a lag cannot be distinguished from an offset. If parts of the motion have different lags, the
+    parts with larger motion dominate. Example: ten seconds at 60 Hz with 0.5 mm of motion per axis.
+    The standard error is 0.6 ms with white noise of 0.1 mm, and 1.9 ms with noise of 0.3 mm.
 
-    times_s: (n,), increasing, not necessarily uniform.
-    follower, leader: positions (n,) or (n, k), m, at these times.
-    leader_times_s: times (m,) of the leader, if they differ from `times_s`. They must cover the
-        range of `times_s`.
+    times_s: n increasing times; their differences need not be equal.
+    follower, leader: positions at these times, m, with shape (n,), or (n, k) for k axes.
+    leader_times_s: times of the leader's positions, if they differ from `times_s`. They must cover
+        the range of `times_s`.
 
     Returns None if the motion is only a linear trend, the correlation is below MIN_CORRELATION, or
-    the best shift is at the end of the range. Raises ValueError for invalid times, values that are
-    not finite or differ in number, and durations up to four times `max_lag_s`.
+    the best shift is +max_lag_s or -max_lag_s. Raises ValueError if the times are invalid, or if
+    values are not finite or differ in number. It is also raised if the duration is at most four
+    times `max_lag_s`.
     """
     follower_rows, leader_rows = (_to_rows(values) for values in (follower, leader))
     leader_s = times_s if leader_times_s is None else leader_times_s
@@ -90,11 +91,11 @@ def estimate_lag_s(
 
 
 def _to_rows(values: Floats) -> Floats:
-    """Return values with shape (n,) or (n, k) as an array with shape (n, k)."""
+    """Return n values (n,), or n vectors (n, k), as an array with n rows."""
     array = np.asarray(values, dtype=np.float64)
     return array[:, None] if array.ndim == 1 else array
 
 
 def _compute_rms(values: Floats) -> float:
-    """Return the root mean square of the lengths of the rows of an array (n, k)."""
+    """Return the root mean square of the lengths of n vectors (n, k)."""
     return float(np.sqrt((values**2).sum(axis=1).mean()))

@@ -6,9 +6,9 @@ of fingertip, sheet, image and felt force are computed at rest. The errors of fi
 can also be computed for a constant speed of the finger, at which wrong exposure times cause errors.
 
 Only the force model of the rubber depends on time: it simulates a push in and out. Therefore servo
-    lag, delays, frame rate, tremor and backlash have no effect. An experiment with running nodes
-    measures these effects. Images have no noise. Separate models of camera, arms, membrane and eye
-    compute the reference values. These models share no code with the nodes.
+lag, delays, frame rate, tremor and backlash have no effect. An experiment with running nodes
+measures these effects. Images have no noise. Separate models of camera, arms, membrane and eye
+compute the reference values. These models share no code with the nodes.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ MOVING_METRICS = frozenset({Metric.SHEET, Metric.FINGERTIP})
 CROSS_RATIOS, CROSS_ASIDES_M = (-1.0, -0.5, 0.0, 0.5, 1.0), (-0.03, 0.0, 0.03)
 """The positions of the crosses that are drawn on the object to measure the visual error.
 
-The first values are fractions of the stroke along the object, the second ones distances to the
-right, in metres.
+The first tuple contains fractions of the arc that the finger can touch. The second tuple contains
+distances (m) to the right.
 """
 
 
@@ -105,12 +105,12 @@ right, in metres.
 class Evaluation:
     """The errors of one apparatus; a field is None if it was not evaluated.
 
-    fingertip_m: (n, 3), measured minus true fingertip.
+    fingertip_m: (n, 3), measured minus true fingertip position at n contact points.
     sheet_m: (n, 3), point of the object under the true finger minus the contact point of the sheet.
     image_m: one map (rows, columns, 2) of image errors per case; NaN if the object is not visible
         at a pixel.
-    felt_n, expected_n: (k,), force of the true sheet, and force that the planner's model of the
-        sheet predicts for the same push.
+    felt_n, expected_n: (k,), k forces of the true sheet, and the forces that the planner's model of
+        the sheet predicts for the same pushes.
     """
 
     fingertip_m: Floats | None = None
@@ -133,7 +133,7 @@ class Evaluation:
         }
 
     def change_from(self, other: Evaluation) -> dict[str, float | None]:
-        """Return the mean differences from another evaluation of the same cases, by metric.
+        """Return, for each metric, the mean difference from another evaluation of the same cases.
 
         Errors of single vectors, pixels and pushes are subtracted before averaging. Therefore
         errors common to both evaluations cancel. The units are those of `figures`.
@@ -170,7 +170,7 @@ def _mean_length_mm(vectors_m: Floats | None) -> float | None:
 
 
 def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
-    """Return the root mean square (mm) over all visible points of error maps, or None."""
+    """Return the root mean square (mm) of error maps (m), or None if no point is visible."""
     squares = np.concatenate([np.sum(one**2, axis=2).ravel() for one in maps_m])
     squares = squares[np.isfinite(squares)]
     return 1e3 * float(np.sqrt(squares.mean())) if len(squares) else None
@@ -182,7 +182,8 @@ class CrossErrors:
 
     All positions are projected from an eye onto the screen plane.
 
-    places_m (n, 2): expected contact points, seen from the midpoint between the true eyes.
+    places_m (n, 2): expected contact points of the n crosses, seen from the midpoint between the
+        true eyes.
     errors_m (n, 2, 2): positions (x, y) at which the left and the right eye see the cross, minus
         the positions of the actual contact.
     """
@@ -191,7 +192,7 @@ class CrossErrors:
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return mean and maximum lengths (mm) of the errors of the eyes and of the disparity."""
+        """Return the mean and maximum lengths (mm) of the eyes' errors and the disparity error."""
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {
@@ -222,7 +223,7 @@ class OfflineEvaluator:
     """An evaluator of the errors of apparatuses (true hardware parameters) in one scene.
 
     metres_per_px: resolution of the images.
-    cells: number of node intervals per side of the mesh of the true sheet.
+    cells: number of mesh intervals per side of the true sheet.
     correction, sheet_shape: methods of the renderer.
     """
 
@@ -269,7 +270,8 @@ class OfflineEvaluator:
     ) -> Evaluation:
         """Evaluate the given metrics of an apparatus.
 
-        speed_m_per_s: speed of the finger along the object. It affects only fingertip and sheet.
+        speed_m_per_s: speed of the finger along the object. The speed affects only the errors of
+        fingertip and sheet.
 
         Raises ExperimentError if the equations of the sheet or the arms have no solution.
         """
@@ -305,8 +307,10 @@ class OfflineEvaluator:
     def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
         """Return the contact after the sheet has rolled over the object without slip.
 
-        The sheet starts in contact with the front of the object. around_m, aside_m: arc length
-        around the object, and distance to the right, from the front to the new contact point.
+        The sheet starts in contact with the front of the object.
+
+        around_m: arc length around the object from the front to the new contact point.
+        aside_m: distance from the front to the new contact point, to the right.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))
@@ -407,9 +411,9 @@ class OfflineEvaluator:
     def _compare_forces(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the felt forces (k,) and the forces (k,) that the planner's model predicts, in N.
+        """Return k felt forces (N), and the k forces (N) that the planner's model predicts.
 
-        Each push gives two forces, in loading and in unloading.
+        Each push gives two forces, one in loading and one in unloading.
         """
         contact = self._touch(0.0)
         left, right = arms.hold(self._edges(contact))
@@ -475,7 +479,8 @@ class OfflineEvaluator:
     def _estimate_sheet(self, edges: tuple[Floats, Floats], finger_tip: Floats | None) -> SheetPose:
         """Return the sheet that the renderer assumes between resting edges.
 
-        edges: poses (4, 4) of the edges. finger_tip: position (3,), m, or None.
+        edges: poses (4, 4) of the edges. finger_tip: position (3,), m; None if no finger touches
+        the sheet.
         """
         height_m = self._scene.sheet.height_m
         sheet = estimate_sheet(*edges, height_m=height_m, finger_tip=finger_tip)
@@ -560,7 +565,8 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return the shift (rows, columns, 2), m, of object points on the screen if the eye moves.
+        """Return the shift (rows, columns, 2), m, of object points on the screen if the eye is at
+        `eye`.
 
         The pixels are the same as in `_object_points`. The shift is NaN if the ray of a pixel
         misses the object.
@@ -595,7 +601,10 @@ class OfflineEvaluator:
 
 
 def _on_screen(eye: Floats, points: Floats) -> Floats:
-    """Project points (n, 3) from an eye (3,) to (x, y) (n, 2), m, on the screen plane z = 0."""
+    """Project n points (n, 3) from an eye (3,) onto the screen plane z = 0.
+
+    Returns the coordinates (x, y) on the screen plane, (n, 2), m.
+    """
     to_screen = eye[2] / (eye[2] - points[:, 2:])
     return np.asarray(eye[:2] + (points[:, :2] - eye[:2]) * to_screen)
 
@@ -603,7 +612,7 @@ def _on_screen(eye: Floats, points: Floats) -> Floats:
 def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:
     """Return the names of the metrics whose errors exceed the scene's tolerances.
 
-    figures: errors by metric.
+    figures: error of each metric.
     """
     limits = metric_tolerances(scene)
     return [

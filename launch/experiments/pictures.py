@@ -23,7 +23,9 @@ EVENTS = tuple(event for event in LatencyEvent if event is not LatencyEvent.LIGH
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)
-"""The drawn part of the eye's image, as fractions of its size; outside it, the image is dark."""
+"""The drawn part of the eye's image, as fractions of its size; outside this part, the image is
+dark.
+"""
 
 CORRECTION_NAMES = {
     "none": "not corrected",
@@ -34,7 +36,9 @@ CORRECTION_NAMES = {
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw the eye's image for each image correction, and the expected image, one row per case."""
+    """Draw the eye's image for each image correction, and the expected image, with one row per
+    case.
+    """
     columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
@@ -62,7 +66,10 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -
 
 
 def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Return the bounding box (left, top, width, height) of all non-black pixels, or None."""
+    """Return the bounding box (left, top, width, height) of all non-black pixels.
+
+    Return None if all pixels are black.
+    """
     ys, xs = np.nonzero(image.max(axis=2) > MAX_BLACK)
     if len(xs) == 0:
         return None
@@ -106,7 +113,9 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
 
 
 def draw_latency(recording: StrokeRecording, path: Path) -> None:
-    """Draw the latencies from exposure to each event, as medians and ranges from 1 to 99 %."""
+    """Draw the latencies from exposure to each event, as medians and as ranges between the 1 % and
+    99 % quantiles.
+    """
     events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
     figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
     axes = figure.subplots()
@@ -180,7 +189,9 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_stability(result: dict[str, Any], path: Path) -> None:
-    """Draw the fraction of stable hands against stiffness and delay, one panel per control loop."""
+    """Draw the fraction of stable hands against stiffness and delay, with one panel per control
+    loop.
+    """
     rows = [*result["rows"], *result["without_bounds"]]
     kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})
@@ -230,8 +241,9 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
 def draw_hand_gestures(forces: Mapping[tuple[str, str], FeltForce], path: Path) -> None:
     """Draw the felt force and the object's force against time.
 
-    The figure has one row per hand and one column per gesture. forces: forces by (kind of hand,
-    gesture).
+    The figure has one row per hand and one column per gesture.
+
+    forces: felt and object forces; a key is (kind of hand, gesture).
     """
     hands, names = (list(dict.fromkeys(key[number] for key in forces)) for number in (0, 1))
     figure = Figure(figsize=(3.4 * len(names), 2.2 * len(hands)), layout="constrained")

@@ -1,4 +1,4 @@
-"""Choose free TCP ports for simulated arms, to run several graphs on one computer."""
+"""Choose free TCP ports for simulated arms, so that several graphs can run on one computer."""
 
 from __future__ import annotations
 

@@ -31,7 +31,10 @@ _RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Parse random seeds "A-B" (both included) or "A"; raise ExperimentError if invalid."""
+    """Parse random seeds from the text "A-B" (both included) or "A".
+
+    Raises ExperimentError if the text is invalid.
+    """
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise ExperimentError(f'--seeds "{text}": expected A-B, such as 0-9, or one whole number')
@@ -65,9 +68,9 @@ def run_robustness(
 ) -> dict[str, Any]:
     """Run one trial per seed, and return the results of `experiment robustness --json`.
 
-    commissioned: calibrate each simulated laboratory first, in a separate folder, and evaluate it
-        in simulated time with the resulting scene and launch file. The apparatus then has the
-        errors of uncalibrated hardware, and the calibrated camera defines the world frame.
+    commissioned: whether each simulated laboratory is calibrated first, in a separate folder. Then
+        it is evaluated in simulated time with the resulting scene and launch file. The apparatus
+        has the errors of uncalibrated hardware, and the calibrated camera defines the world frame.
     """
     if commissioned and calibrated:
         raise ExperimentError(
@@ -132,8 +135,8 @@ def run_robustness(
 def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
     """Compare the errors that the laboratories' reports predict with the true errors.
 
-    confusion: number of laboratories by report (good or not) and by true errors (within tolerance
-        or not), in total and by metric.
+    confusion: number of laboratories for each combination of report (good or not) and true errors
+        (within tolerance or not), in total and for each metric.
     stated_over_true: quantiles of the ratio of predicted rms error to true error.
     covered: fraction of true errors below the predicted 95 % quantile.
     """
@@ -190,7 +193,7 @@ def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
 
 
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
-    """Summarize the trials by metric.
+    """Summarize the trials for each metric.
 
     A summary contains the median, the 95 % quantile and the maximum of the metric, and the seed of
     the maximum. It also contains the number of trials that have the metric, and the number of

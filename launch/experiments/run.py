@@ -213,8 +213,9 @@ def make_image_procedure(
 ) -> Procedure:
     """Make a procedure that captures an image of each case (value and correction method).
 
-    with_maps: also take images of coordinate ramps, for errors at all visible points. with_eyes:
-    also take images for each eye separately.
+    with_maps: whether to take images of coordinate ramps, from which the errors at all visible
+        points are computed.
+    with_eyes: whether to take images for each eye separately.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:

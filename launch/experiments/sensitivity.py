@@ -82,7 +82,9 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
 }
-"""The metrics that the parameters in a section of the apparatus affect at rest, by section."""
+"""The sections of the apparatus, with the metrics that the parameters of each section affect at
+rest.
+"""
 
 
 def evaluation_of(parameter: str) -> EvaluationKind:
@@ -110,7 +112,8 @@ def run_sensitivity(
 ) -> dict[str, Any]:
     """Vary the parameters individually, and return the results of `experiment sensitivity --json`.
 
-    folder: where the results of finished trials are stored. seconds: duration of a stroke.
+    folder: folder in which the results of finished trials are stored. seconds: duration of a
+    stroke.
     """
     plan = load_graph(launch_file, settings=settings)
     scene = require_scene(plan)
@@ -164,12 +167,14 @@ def _make_row(
     evaluation: EvaluationKind,
     effects: Mapping[str, Mapping[str, float | None]] | None,
 ) -> Row:
-    """Return the effects of one deviation of a parameter. If a metric was not evaluated, its effect
-    is None.
+    """Return the effects of one deviation of a parameter.
+
+    The effect on a metric is None if the metric was not evaluated.
 
     At rest, an effect is the mean change of single vectors, pixels and pushes. In simulated time,
-    an effect is the mean error minus the mean error with the nominal apparatus. sigma: deviation in
-    standard deviations.
+    an effect is the mean error minus the mean error with the nominal apparatus.
+
+    sigma: size of the deviation, in standard deviations.
     """
     row: Row = {"parameter": parameter, "sigma": sigma, "evaluation": evaluation.value}
     row |= {metric.value: None for metric in Metric}

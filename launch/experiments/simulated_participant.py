@@ -76,7 +76,7 @@ class SimulatedParticipant:
 
 
 def draw_perception(seed: int) -> Perception:
-    """Return random perception parameters of a participant."""
+    """Return random perception parameters for a participant."""
     random = np.random.default_rng((seed, SEED_STREAM))
     low, high = np.log(WEBER_RANGE)
     weber = math.exp(random.uniform(low, high))

@@ -1,10 +1,10 @@
 """Simulate tracking, planning and both arms in simulated time, without running nodes.
 
-The nodes' methods are called at the simulated times at which the nodes would call them: at the
-exposure, when its image arrives, when its target takes effect, and in each arm cycle. The results
-are reproducible, and do not depend on the load of the computer. The path check before the first
-motion, the synchronization of the arms, and stops are not simulated. Images are simulated only on
-request. The soft body applies no force, so the sheet's stretch does not change.
+The nodes' methods are called at the simulated times at which the nodes would call them. These are
+the exposure, the arrival of the image, the time when the sheet target takes effect, and each arm
+cycle. The results are reproducible, and do not depend on the load of the computer. The path check
+before the first motion, the synchronization of the arms, and stops are not simulated. Images are
+simulated only on request. The soft body applies no force, so the sheet's stretch does not change.
 
 The ground truth comes from the simulator: camera, servos, flange compliance and sheet surface.
 """
@@ -97,14 +97,15 @@ The arm bridges use the same values.
 """
 
 SETTLING_S = 2.0
-"""The time (s) for which the finger rests at the start of the path, until the sheet is there."""
+"""The time (s) for which the finger rests at the start of the path, so that the sheet can reach it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
     """The settings of a simulation run.
 
-    planner: parameters of the planner by name.
+    planner: parameters of the planner, with their names as keys.
     lag_known: whether the bridges know the true servo lag of the arms; otherwise they measure it.
     computing_s: time from the end of the camera's read-out to the published target.
     calibrations: calibrated parameters that the nodes use. If None, the nodes know camera, marker
@@ -145,7 +146,8 @@ class MeasuredFinger:
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Measure the finger at a timestamp, and return its predicted path (n, 3), in m.
+        """Measure the finger at a timestamp, and return n positions (n, 3), in m, of its predicted
+        path.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
         timestamp, (3,). The images are exposed slightly later.
@@ -200,7 +202,9 @@ class FilmedFinger:
         return Header(1, at_ns, at_ns, "virtual", "camera", 1)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Take images of the finger at a timestamp, and return its predicted path (n, 3), in m.
+        """Take images of the finger at a timestamp, and return its predicted path.
+
+        The path consists of n positions (n, 3), in m.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
         timestamp, (3,).
@@ -257,18 +261,22 @@ class SimulatedArm:
         self._now_s = 0.0
 
     def sheet_to(self, other: SimulatedArm) -> SheetMotion:
-        """Return the motion of the sheet between two arms, from joint angles as in a bridge."""
+        """Return the motion of the sheet between two arms, computed from joint angles as in an arm
+        bridge.
+        """
         edges = [arm._geometry.world_from_edge(arm._servo.joints_rad) for arm in (self, other)]
         return self._geometry.sheet_between(*edges)
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge uses: measured, or known in advance."""
+        """Return the servo lag (s) that the bridge uses: a measured value, or a value known in
+        advance.
+        """
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property
     def lag_uncertainty_s(self) -> float | None:
-        """Return the standard deviation (s) of the measured servo lag; None if unknown."""
+        """Return the standard deviation (s) of the measured servo lag, or None if it is unknown."""
         return None if self._lag.estimate is None else self._lag.estimate.uncertainty_s
 
     def advance(self, until_s: float) -> Floats:
@@ -578,11 +586,12 @@ def stroke_in_simulated_time(
 class TouchRecording:
     """A recorded touch of a simulated hand that the sheet pushes.
 
-    times_s (n,): times of the exposures.
-    positions_m (n, 3): true fingertip.
+    times_s (n,): times of the n exposures.
+    positions_m (n, 3): true fingertip positions.
     phases (n,): contact phase of the planner.
-    steps (k, 3): time (s), indentation of the sheet (m) and its force (N) of each time step.
-    watchdog_triggers: number of oscillations that the planner stopped; None if unknown.
+    steps (k, 3): time (s), indentation (m) and force (N) of the sheet in each of k time steps.
+    watchdog_triggers: number of oscillations that the planner stopped; None if the number is
+        unknown.
     delay_s: time from an exposure to the sheet's motion.
     """
 
@@ -605,7 +614,7 @@ def touch_in_simulated_time(
 ) -> TouchRecording:
     """Simulate a hand that moves along a voluntary path while the sheet pushes the finger.
 
-    curve: (m, 2), depths (m) and forces (N) of the object.
+    curve: (n, 2), n pairs of depth (m) and force (N) of the object.
     make_finger: function that makes the simulated finger from its voluntary path.
     bounds: the planner's bounds on the sheet's offset.
     """
@@ -647,7 +656,7 @@ def touch_in_simulated_time(
 def make_soft_body(curve: Floats, stiffness_n_per_m: float = 0.0) -> SoftBody:
     """Return an undeformed soft body with a force curve.
 
-    curve: (m, 2), depths (m) and forces (N).
+    curve: (n, 2), n pairs of depth (m) and force (N).
     """
     return SoftBody(
         mesh_id="",

@@ -4,7 +4,7 @@ The sheet's offset (its depth) depends on the finger depth; the slope is the rat
 Two simulations run in the time domain, without running nodes:
 
 - boundary: the critical slope, above which a random hand is not stable. It is compared with the
-  prediction by the eigenvalues of the sampled control loop (`nodes.models.hand_loop`).
+    prediction from the eigenvalues of the sampled control loop (`nodes.models.hand_loop`).
 - map: the stability with the offset that the planner uses for objects of several stiffnesses.
   Random hands, delays, packet jitters and depths are combined, with and without the planner's
   bounds.
@@ -48,7 +48,8 @@ HAND_RANGES = {
     "wrist": ((0.1, 0.2), (100.0, 400.0), (0.15, 0.5)),
     "arm": ((0.5, 1.5), (100.0, 800.0), (0.15, 0.6)),
 }
-"""The ranges of mass (kg), stiffness (N/m) and damping ratio of random hands, by kind of hand.
+"""The ranges of mass (kg), stiffness (N/m) and damping ratio of random hands, for each kind of
+hand.
 
 `nodes.models.hand_loop` lists the sources.
 """
@@ -65,7 +66,10 @@ GAINS = (1.0, 1.25, 1.5, 2.0, 3.0)
 
 LINEAR_STIFFNESS_N_PER_M, LINEAR_DEPTH_M = 100.0, 0.02
 MAX_BOUNDARY_SLOPE = 1.5
-"""The maximum slope that is compared; above it, the finger loses contact with the sheet."""
+"""The maximum critical slope that is compared with the prediction.
+
+At larger slopes, the finger loses contact with the sheet.
+"""
 
 SLOPES = 32
 FILTERS = ((math.inf, False), (math.inf, True), (10.0, False))
@@ -80,7 +84,7 @@ An infinite bandwidth means that the depth is not filtered.
 class StabilitySettings:
     """The settings of the experiment.
 
-    hands: number of random hands per group of HAND_RANGES, sampled with `seed`.
+    hands: number of random hands in each group of HAND_RANGES, sampled with `seed`.
     delays_s, jitters_s: delays of the control loop and their jitter.
     rates_hz: camera rates at which the critical slope is measured.
     object_ratios: factors of the stiffness of the scene's object.
@@ -144,10 +148,12 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
 
 
 def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Floats:
-    """Return the smallest slopes (n,) of the offset at which the hands become unstable.
+    """Return the smallest slope of the offset at which the hand of each trial becomes unstable.
 
-    If a slope is above 1.5, the result is NaN. The sheet is linear. All trials must have the same
-    period.
+    The result is NaN for a hand that is stable up to a slope of 1.5. The sheet is linear. All
+    trials must have the same period.
+
+    towards_finger: whether the slopes are negative, so that the sheet moves towards the finger.
     """
     slopes = np.geomspace(0.03, MAX_BOUNDARY_SLOPE, SLOPES)
     motion = simulate_release(
@@ -166,7 +172,9 @@ def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Fl
 
 
 def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[dict[str, Any]]:
-    """Return the simulated and the predicted critical slopes, one row per hand and control loop."""
+    """Return the simulated and the predicted critical slopes, with one row per hand and control
+    loop.
+    """
     hands = draw_hands(settings.hands, settings.seed)
     rows: list[dict[str, Any]] = []
     for rate_hz, towards in product(settings.rates_hz, (True, False)):

@@ -55,9 +55,9 @@ PAPER_TABLE_1 = {
     10.0: {"delta_d_mm": (0.443, 0.0330), "delta_theta_deg": (0.359, 0.267)},
     30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
 }
-"""The errors in Table I of Furukawa et al. 2007, by duration of the stroke (s).
+"""The errors in Table I of Furukawa et al. 2007; the keys are durations of strokes (s).
 
-The values are mean and standard deviation.
+Each value is a mean and a standard deviation.
 """
 
 NO_VALUES: Floats = np.empty(0)
@@ -86,7 +86,8 @@ ARM_EVENTS: dict[Side, LatencyEvent] = {
 class DrawnFrames:
     """The contents of the drawn frames, with the time (ns) at the centre of each frame's display.
 
-    fingertip: drawn fingertip position (3,), m. sheet: centre and normal of the sheet (6,).
+    fingertip: drawn fingertip position (3,), m.
+    sheet: centre (m) and normal of the drawn sheet, (6,).
     deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
     """
 
@@ -173,13 +174,13 @@ def object_pose(scene: Scene) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SampledMotion:
-    """A sampled motion with times (n,) in ns, and k values at each time (n, k)."""
+    """A motion that is sampled at n times (ns), with k values at each time."""
 
     times_ns: NDArray[np.int64]
     values: Floats
 
     def interpolate(self, times_ns: NDArray[np.int64]) -> Floats:
-        """Return the values (m, k) at the given times (m,) in ns, by linear interpolation.
+        """Return the k values at each of the given times (ns), by linear interpolation.
 
         Times are converted to floats relative to the first sample, because a float cannot store the
         time since the computer's start in ns exactly.
@@ -189,7 +190,7 @@ class SampledMotion:
         return np.column_stack([np.interp(x, xp, column) for column in self.values.T])
 
     def covers(self, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return a mask (m,) that is True for times between the first and the last sample."""
+        """Return a mask that is True for the times between the first and the last sample."""
         inside: NDArray[np.bool_] = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
         return inside
 
@@ -216,14 +217,16 @@ class StrokeRecording:
     """The data of a stroke experiment, read from a bag.
 
     fingertip, measured, finger: filtered, measured and true position of the fingertip.
-    windows_ns: start and end of each finger path, by label.
+    windows_ns: start and end (ns) of each finger path; the keys are the labels of the paths.
     measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
         y axis and z axis of an edge in the world frame.
-    delays_s: delays from the centre of an exposure to the events that it caused, by event.
+    delays_s: delays from the centre of an exposure to the events that it caused; the keys are the
+        kinds of events.
     drops: number of lost or refused messages. Messages that a `latest` reader skipped are not
     counted.
     apparatus: origin of the true parameters of the simulated hardware.
-    surface, true_surface: shape of the unloaded sheet, by the scene and by the apparatus.
+    surface, true_surface: shape of the unloaded sheet according to the scene, and according to the
+        apparatus.
     loads: times (ns) of load reports of the computers, and whether the computer was overloaded.
     """
 
@@ -407,7 +410,7 @@ def compute_sheet_planes(
     world_from_object: Floats,
     times_ns: NDArray[np.int64],
 ) -> SheetPlanes:
-    """Return the planes through both clamped edges at times (n,), in the object's frame."""
+    """Return the planes through both clamped edges at n times (ns), in the object's frame."""
     object_from_world = inverse(world_from_object)
     left, right = (
         np.concatenate(
@@ -432,8 +435,10 @@ def compute_sheet_planes(
 def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Floats]:
     """Return the contact points D' (n, 3), in m, of a sheet on a cylinder, and their angles (n,).
 
-    D' is the point of the sheet's plane that is nearest to the cylinder axis at x = `x_m` (n,), in
-    the object's frame. The angle (rad) is the direction of the plane's normal around the axis.
+    For each of n positions x on the cylinder axis, D' is the nearest point of the sheet's plane.
+    The angle (rad) is the direction of the plane's normal around the axis.
+
+    x_m: positions x (n,), m, in the object's frame.
     """
     normal = planes.normals
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
@@ -449,11 +454,11 @@ Flatter surfaces have many points with nearly the same normal.
 
 
 def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
-    """Return the contact points D' (n, 3), in m, of a sheet on an object of any shape.
+    """Return n contact points D' (n, 3), in m, of a sheet on an object of any shape.
 
     D' is the surface point that has the plane's normal, projected onto the plane. Along a direction
-    without curvature, D' has the position of the foot. The error of this approximation is of second
-    order in the angle between the normals.
+    in which the surface is not curved, D' has the position of the object point that is nearest to
+    the finger. The error of this approximation is of second order in the angle between the normals.
 
     foot: points of the object nearest to the finger.
     centre, normal: (n, 3), point and normal of the sheet's plane.
@@ -479,7 +484,8 @@ def sheet_errors(
     shape: Shape | None = None,
     surface: SheetSurface | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return the sheet's errors delta d (n,) in m and delta theta (n,) in rad at `times_ns`.
+    """Return the sheet's errors delta d (n,) in m and delta theta (n,) in rad at n times
+    `times_ns`.
 
     The errors are relative to the surface at the commanded depth of the sheet. Therefore the push
     depth is not an error. On a cylinder, delta theta is the angle about its axis, as in Furukawa et
@@ -487,7 +493,7 @@ def sheet_errors(
 
     finger, edges: motions of the fingertip and of both clamped edges.
     normal_offset_m: (n,), commanded depth of the sheet below the undeformed surface.
-    shape: shape of the scene's object, if already computed.
+    shape: shape of the scene's object; if it is None, the function computes the shape.
     surface: shape of the unloaded sheet; None if the sheet is flat.
     """
     world_from_object = object_pose(scene)
@@ -513,10 +519,11 @@ def sheet_errors(
 
 
 def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
-    """Return the measured positions from the first to the last of `times_ns`, smoothed.
+    """Smooth the measured positions from the first to the last of `times_ns`.
 
-    A cubic smoothing spline is fitted to each coordinate by generalized cross-validation. It also
-    uses later measurements, so its error estimates a lower bound for causal filters.
+    A cubic smoothing spline is fitted to each coordinate by generalized cross-validation. The
+    spline also uses later measurements. Therefore its error estimates a lower bound for the error
+    of causal filters.
     """
     inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
     times, values = measured.times_ns[inside], measured.values[inside]
@@ -526,7 +533,7 @@ def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> Sampl
 
 
 def summary(values: Floats, scale: float) -> dict[str, float]:
-    """Return mean, standard deviation and maximum of values (n,), multiplied by `scale`."""
+    """Return mean, standard deviation and maximum of the values, multiplied by `scale`."""
     scaled = values * scale
     return {
         "mean": float(scaled.mean()),
@@ -536,7 +543,7 @@ def summary(values: Floats, scale: float) -> dict[str, float]:
 
 
 def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
-    """Return the median and the 99 % quantile (ms) of durations (n,) in s.
+    """Return the median and the 99 % quantile, in ms, of durations in s.
 
     Both are None if there are no durations.
     """
@@ -552,11 +559,11 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 class StrokeErrors:
     """The errors of a stroke as functions of time, in m and rad.
 
-    seconds: (n,), times of exposures with a valid fingertip, since the start of the stroke. The
+    seconds: times (s) of the n exposures with a valid fingertip, since the start of the stroke. The
         measured errors belong to these times.
-    true_seconds: (m,), times of all exposures, to which the true errors belong.
+    true_seconds: times (s) of all k exposures, to which the true errors belong.
     smoother_m, fingertip_m: (n,), errors of the offline smoother and of the fingertip.
-    arcs_m: (m, 2), arc lengths around the object to the true contact line and to the true finger.
+    arcs_m: (k, 2), arc lengths around the object to the true contact line and to the true finger.
     """
 
     seconds: Floats
@@ -637,10 +644,13 @@ def compute_arcs(
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Return arc lengths (n, 2), in m, around the cylinder.
+    """Return arc lengths (n, 2), in m, around the cylinder at n times.
 
-    The first column belongs to the contact line of the sheet, the second column to `points` (n, 3),
-    m, in the world frame. edges: motions of both clamped edges.
+    The first column belongs to the contact line of the sheet. The second column belongs to
+    `points`.
+
+    edges: motions of both clamped edges.
+    points: n points (n, 3), m, in the world frame.
     """
     planes = compute_sheet_planes(edges, object_pose(scene), times_ns)
     _, angles = find_presented_points(planes, np.zeros(len(points)))
@@ -649,13 +659,14 @@ def compute_arcs(
 
 
 def _compute_angles(scene: Scene, points: Floats) -> Floats:
-    """Return the angles (n,), rad, of world points (n, 3) around the axis of the cylinder."""
+    """Return the angles (n,), rad, of n world points (n, 3) around the axis of the cylinder."""
     local = apply(inverse(object_pose(scene)), points)
     return np.asarray(np.arctan2(local[:, 1], local[:, 2]))
 
 
 def tangential_distance(scene: Scene, points: Floats, others: Floats) -> Floats:
-    """Return the distances (n,), in m, between pairs of points that are projected on the cylinder.
+    """Return the distances (n,), in m, between n pairs of points that are projected on the
+    cylinder.
 
     points, others: (n, 3). Distances along the cylinder's axis are ignored.
     """

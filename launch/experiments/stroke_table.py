@@ -54,7 +54,7 @@ class Variant:
 def make_variants(
     launch_file: Path, folder: Path, *, apparatus: str | None, ablations: bool, radii: bool
 ) -> list[Variant]:
-    """Return the variants to measure; the first one is the given configuration.
+    """Return the variants to measure; the first variant is the given configuration.
 
     The files of the other variants are written to the folder.
 
@@ -185,8 +185,8 @@ def _trial_name(variant: Variant, number: int) -> str:
 def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
     """Summarize the errors, latencies and lost messages of repeated strokes.
 
-    The result also contains the number of strokes and the errors of failed strokes. Errors: see
-    `summarize_means`.
+    The result also contains the number of strokes and the errors of failed strokes. The errors are
+    summarized as in `summarize_means`.
     """
     good = [row for row in rows if "error" not in row]
     result: dict[str, Any] = {
@@ -209,7 +209,7 @@ def summarize_means(strokes: Sequence[Mapping[str, float]]) -> dict[str, float |
     """Summarize the errors of repeated strokes.
 
     mean: mean of the strokes' mean errors.
-    std: mean of their standard deviations.
+    std: mean of the strokes' standard deviations.
     max: largest error.
     interval: half the width of the mean's confidence interval; None for fewer than two strokes.
     """

@@ -89,7 +89,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def read_rows(folder: Path, names: Mapping[str, Any]) -> dict[str, Row]:
-    """Return the result rows of successful trials, by trial name."""
+    """Return the result rows of successful trials; the keys are the names of the trials."""
     files = {name: folder / f"{name}.json" for name in names}
     rows = {name: _read_json(file) for name, file in files.items() if file.exists()}
     return {name: row for name, row in rows.items() if "error" not in row}
@@ -104,11 +104,13 @@ def run_sweep(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Row]:
-    """Run all trials that have no result row yet; return all rows by name, in the trials' order.
+    """Run all trials that have no result row yet, and return the rows of all trials.
+
+    The keys are the names of the trials, in the order of `trials`.
 
     A failed trial has a row with the key `error`, and does not stop other trials.
 
-    trials: description of each trial for the module `trial`, by name.
+    trials: descriptions of the trials for the module `trial`, with trial names as keys.
     workers: number of simultaneous trials on this computer; ignored if a scheduler is given.
     scheduler: address of the scheduler that runs the trials.
     """

@@ -62,7 +62,7 @@ TOUCH_M = 0.001
 tremor."""
 
 STROKED_RATIO = 0.9
-"""The fraction of the touchable arc length of the object that the finger strokes."""
+"""The stroked part of the arc length that the finger can touch, as a fraction."""
 
 SAMPLE_S = 0.05
 MAX_STEP_RAD = 0.1
@@ -70,8 +70,7 @@ MAX_STEP_RAD = 0.1
 
 APPROACH_S = 1.0
 WARM_UP_S = 0.5
-"""The time (s) after the approach in which errors are not evaluated, until the sheet has
-settled."""
+"""The time (s) after the approach in which the sheet settles and errors are not evaluated."""
 
 HOVER_M = 0.03
 METRES_PER_PX = 0.0014
@@ -95,7 +94,7 @@ finger; true minus computed sheet.
 
 
 def make_stroke(scene: Scene, seconds: float) -> FingerPath:
-    """Return a finger path that strokes back and forth around the object.
+    """Return the path of a finger that strokes back and forth around the object.
 
     The maximum speed is the speed of the scene's working range.
 
@@ -278,15 +277,16 @@ def _load_curve(scene_json: str, method: SoftBodyMethod, spacing_m: float) -> So
 def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
     """Return the undeformed soft body of a scene.
 
-    choice: method and spacing of the surface nodes. If a required table is not computed, the linear
-    method is used instead, as in the solver node.
+    choice: method and spacing of the surface nodes. If a required table has not been computed yet,
+    the linear method is used instead, as in the solver node.
     """
     given = choice or SoftBodyChoice(method="linear", skin_spacing_m=0.003)
     return _load_curve(scene.model_dump_json(), given.method, given.skin_spacing_m)
 
 
 def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:
-    """Split the sheet's error into the errors (3, n, 3), in m, of the three stages `STAGES`.
+    """Split the sheet's error at n times into the errors (3, n, 3), in m, of the three stages
+    `STAGES`.
 
     The total error is the difference of two points in the object's frame. The first is the object's
     point nearest to the true finger, moved inward by the commanded offset (n, 1). The second is the
@@ -319,7 +319,7 @@ def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: A
 
 
 def summarize_errors(values: Floats) -> dict[str, float] | None:
-    """Return the mean, 95 % quantile and maximum of values (n,); None if there are no values."""
+    """Return the mean, 95 % quantile and maximum of the values; None if there are no values."""
     if len(values) == 0:
         return None
     return {

@@ -147,7 +147,7 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
 
 
 def summarize_latency(values_s: Floats) -> dict[str, float] | None:
-    """Return the median and the 95 % and 99 % quantiles, in ms, of delays (n,) in s.
+    """Return the median and the 95 % and 99 % quantiles, in ms, of delays in s.
 
     Returns None if there are no delays.
     """

@@ -45,7 +45,7 @@ NICENESS = 10
 
 @contextmanager
 def _bag_of(trial: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield the path of the trial's bag; the bag is temporary if the trial does not name one."""
+    """Yield the path of the trial's bag; the bag is temporary if the trial does not name a bag."""
     if trial.get("bag"):
         yield Path(trial["bag"])
         return
@@ -176,7 +176,9 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the error changes by deviations of one apparatus parameter, without a graph.
+    """Return the changes of the errors that deviations of one apparatus parameter cause.
+
+    No graph is run.
 
     The errors are measured in strokes in simulated time if the trial has `stroke_seeds`, and at
     rest otherwise.

@@ -84,7 +84,7 @@ def _shot(
 
 
 def jpeg(image: Image) -> bytes:
-    """Encode a grey (h, w) or RGB (h, w, 3) image as JPEG.
+    """Encode a grey image (height, width) or an RGB image (height, width, 3) as JPEG.
 
     An image that is wider than `MAX_WIDTH_PX` is reduced to this width.
     """

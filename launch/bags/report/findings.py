@@ -14,7 +14,10 @@ SLOW_RATIO = 0.5
 """The fraction of a topic's minimum rate below which the rate is reported as a problem."""
 
 MAX_UNSEEN_RATIO = 0.05
-"""The maximum fraction of images without a valid fingertip that is not reported as a problem."""
+"""The limit for the fraction of images that give no valid fingertip.
+
+A larger fraction is reported as a problem.
+"""
 
 MAX_LIMIT_RATIO = 1.0
 """The maximum ratio of a value to its limit that is not reported as a problem."""
@@ -39,7 +42,8 @@ class SessionFinding:
 BRIEFLY_BUSY_FRACTION = 0.05
 """The maximum fraction of time for which an overload is reported only as a possible problem.
 
-A longer overload is reported as a failure. So is an overload during which an arm stopped.
+A longer overload is reported as a failure. An overload during which an arm stopped is also reported
+as a failure.
 """
 
 CHECKED = (
@@ -82,7 +86,7 @@ def _times(count: int) -> str:
 def _check_load(numbers: dict[str, Any], affected: list[str]) -> list[SessionFinding]:
     """Return one problem if any computer was overloaded, otherwise an empty list.
 
-    affected: names of the topics with lost or delayed messages.
+    affected: names of the topics whose messages were lost or delayed.
     """
     hosts = [host for host in numbers["hosts"].values() if host["busy_fraction"]]
     if not hosts:
@@ -192,7 +196,10 @@ def _check_refused(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
 
 
 def _check_flow(name: str, topic: dict[str, Any]) -> Iterator[SessionFinding]:
-    """Yield the lost and delayed messages of a topic, which an overload can cause."""
+    """Yield a problem for lost messages and a problem for delayed messages of a topic.
+
+    An overload of a computer can cause both problems.
+    """
     expected, rate = topic["expected_hz"], topic["rate_hz"]
     if topic["lost"]:
         text = f"{name}: {topic['lost']} messages were lost between writer and readers."

@@ -10,7 +10,7 @@ from flexsheet.launch.bags.report.series import Grid, RunningMoments, Spread
 from flexsheet.nodes.arrays import Floats
 
 MAX_CONTACT_HEIGHT_M = 0.001
-"""The maximum height (m) of the finger above the undeformed object at which it is in contact.
+"""The maximum height (m) above the undeformed object at which the finger counts as in contact.
 
 The pad of a fingertip deforms by about this amount.
 """

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from flexsheet.nodes.arrays import Floats
 
 MIN_DURATION_S, MAX_DURATION_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
-"""The minimum and maximum duration (s) in the histogram of `Spread`, and the bins per decade.
+"""The minimum and maximum duration (s) in the histogram of `Spread`, and the number of bins per
+decade.
 
 Each bin is 2.3 % wide.
 """
@@ -42,7 +43,7 @@ class Grid:
         return min(max(int(fraction * self.count), 0), self.count - 1)
 
     def seconds(self) -> Floats:
-        """Return the centres (count,) of the intervals, in s since the start of the bag."""
+        """Return the centres of the intervals, in s since the start of the bag."""
         middles = np.arange(self.count, dtype=np.float64) + 0.5
         return np.asarray(middles * (self.duration_s / self.count))
 
@@ -97,7 +98,7 @@ class Spread:
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
     def quantiles_s(self, fraction: float) -> Floats:
-        """Return a quantile (count,), in s, of the durations in each interval.
+        """Return a quantile (s) of the durations for each interval.
 
         The quantile of an interval is NaN if no durations were added to it.
 

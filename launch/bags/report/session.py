@@ -87,8 +87,8 @@ class Flow:
 
     age: distribution of the time from the source timestamp to the recording.
     lost: number of missing sequence numbers.
-    silences: number of intervals without messages that were longer than permitted.
-    longest_silence_s: duration of the longest interval without messages.
+    silences: number of times when no message arrived for longer than permitted.
+    longest_silence_s: longest time (s) in which no message arrived.
     """
 
     age: Spread

@@ -293,9 +293,10 @@ class SheetErrors:
                 run.followed.add(d[inside], theta[inside], heights[inside], following[inside])
 
     def _read_contact(self, times_ns: Ints) -> tuple[Bools, Floats]:
-        """Return whether the sheet target was in contact (n,), and its normal offset (n,), in m.
+        """Return whether the sheet target was in contact, and its normal offset (m), at each given
+        time.
 
-        times_ns: times (n,) for which the result is computed.
+        times_ns: times (n,). Both results have the shape (n,).
         """
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))

@@ -23,7 +23,7 @@ def default_output(bag: Path) -> Path:
 def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]:
     """Read a bag, write its report as an HTML page, and return the numbers in the report.
 
-    output: path of the page; None: no page is written.
+    output: path of the page, or None if no page is to be written.
 
     Raises BagError if the bag cannot be read or the page cannot be written. Raises BagError also if
     `output` exists and is not a report.
