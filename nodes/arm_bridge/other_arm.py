@@ -84,7 +84,7 @@ class OtherArm:
 
     @cached_property
     def invalid_reason(self) -> str | None:
-        """Return the reason why this state must not be used, or None if it is valid."""
+        """Return the reason why this state must not be used, or None if the state is valid."""
         if not np.isfinite(self.joints_rad).all():
             return "its joint angles are not finite"
         if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):

@@ -11,7 +11,8 @@ from flexsheet.messages.types import ArmMode
 class State(Enum):
     """The states of an arm's controller, with their descriptions for the documentation.
 
-    In states whose names end in `TAUT`, the sheet may be stretched, and the arm may slacken it.
+    In states whose names end in `TAUT`, the sheet may be stretched. The arm is permitted to slacken
+    it.
     """
 
     STARTING = "the arm has not answered since its bridge started"
