@@ -53,7 +53,7 @@ class ArmRefusedError(ArmLinkError):
 
 
 class ArmAnswerError(ArmLinkError):
-    """An error for an answer that is damaged, of an unknown protocol, or to another command."""
+    """An error for an answer that is damaged, invalid or intended for another command."""
 
     code = "arm-answer"
     remedy = (

@@ -93,7 +93,7 @@ class FileReader:
 
 
 class VideoReader(FileReader):
-    """A reader of one video file with both views, or of two video files with paired frames."""
+    """A reader of one video file with both views, or of two video files whose frames are paired."""
 
     def __init__(self, source: VideoSource, camera_rate_hz: float) -> None:
         self._source, self._camera_rate_hz = source, camera_rate_hz
@@ -116,7 +116,10 @@ class VideoReader(FileReader):
         self._pairing = Pairing(1.0 / rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair, or None at the end. Raises DeviceError for a faulty file."""
+        """Return the next image pair, or None at the end of the video.
+
+        Raises DeviceError if a file is faulty.
+        """
         frames = self._next()
         if frames is None and self._source.loop:
             self.close()
@@ -147,7 +150,7 @@ class VideoReader(FileReader):
     def _next(self) -> tuple[FileFrame, ...] | None:
         """Return the two frames of the next image pair, or one frame that contains both views.
 
-        Return None at the end of a file.
+        Returns None at the end of a file.
         """
         if len(self._files) == 1:
             (file,) = self._files
@@ -269,8 +272,9 @@ class ImagesReader(FileReader):
         self._clock = _LoopClock(rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next pair of images, or None at the end. Raises DeviceError for a faulty
-        file.
+        """Return the next image pair, or None after the last pair.
+
+        Raises DeviceError if a file is faulty.
         """
         if self._next == len(self._pairs):
             if not self._loop:

@@ -57,8 +57,8 @@ Regions = tuple[Region, Region]
 class ImagePair:
     """A left and a right grey image (height, width) with nearly equal exposure times.
 
-    exposure_ns: mean of both mid-exposure times on the reader's clock. If the source is a file, the
-        clock starts at the start of the file.
+    exposure_ns: mean of both mid-exposure times on the reader's clock. If the source is a file,
+        this clock starts at the start of the file.
     exposure_s: duration of the exposure that the device reports; None if unknown.
     skew_s: mid-exposure time of the right image minus mid-exposure time of the left image.
     regions: sensor regions of the images; None means full sensors.
@@ -77,9 +77,10 @@ class ImagePair:
 class Reader(Protocol):
     """The interface of readers of image pairs.
 
-    paced: whether `read` returns immediately, as for files. In that case, the caller must wait
-        until each image pair is due.
-    rate_hz: frame rate of a device, to count lost frames; None if the source is a file.
+    paced: whether `read` returns immediately because the images come from files. In that case, the
+        caller must wait until each image pair is due.
+    rate_hz: frame rate of a device, which is necessary to count lost frames; None if the source is
+        a file.
     warnings: texts about settings that the device did not accept.
     opened: texts about the actual format and settings of each device; empty if the source is a
         file.
@@ -91,7 +92,10 @@ class Reader(Protocol):
     opened: tuple[str, ...]
 
     def read(self) -> ImagePair | None:
-        """Wait for the next image pair; return None at the end. Raises DeviceError on failure."""
+        """Wait for the next image pair; return None after the last pair.
+
+        Raises DeviceError if the source fails.
+        """
         ...
 
     def interrupt(self) -> None:
@@ -158,7 +162,7 @@ def describe_skew(skew_s: float, limit_s: float) -> str:
 
 
 def convert_to_gray(image: NDArray[Any]) -> Image:
-    """Convert an image to a grey image (h, w).
+    """Convert an image of height h and width w to a grey image (h, w).
 
     image: grey (h, w) or (h, w, 1), BGR (h, w, 3), or brightness and a second channel (h, w, 2).
     """
@@ -168,11 +172,12 @@ def convert_to_gray(image: NDArray[Any]) -> Image:
 
 
 def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
-    """Split an image (h, 2w) with both views side by side into the left and right view (h, w).
+    """Split an image with both views side by side into the left and the right view.
 
+    image: image (h, 2w) of two views (h, w) with the height h and the width w.
     name: name of the source in the error text.
 
-    Raises DeviceError if the width is odd.
+    Raises DeviceError if the width of the image is odd.
     """
     if image.shape[1] % 2:
         raise DeviceError(

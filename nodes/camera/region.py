@@ -31,7 +31,7 @@ class ExplicitRegions(LimitedModel):
 
 
 def volume_points(low_m: Floats, high_m: Floats) -> Floats:
-    """Return a grid of points (n, 3) that fills the box between two opposite corners (3,)."""
+    """Return a grid of n points (n, 3) that fills the box between two opposite corners (3,)."""
     axes = [np.linspace(low, high, GRID) for low, high in zip(low_m, high_m, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
@@ -39,9 +39,11 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
 def find_visible_region(
     points_camera: Floats, lens: Lens, width_px: int, height_px: int
 ) -> Region | None:
-    """Return the sensor region that shows all visible points (n, 3) m in the camera frame.
+    """Return the sensor region that shows all visible points among n points (n, 3), m.
 
-    Return None if no point is visible, and the full sensor if some points are behind the camera.
+    points_camera: points in the camera frame.
+
+    Returns None if no point is visible, and the full sensor if some points are behind the camera.
     The distortion polynomial is invalid beyond the image's corners. Points beyond the corners are
     therefore moved to the circle through the farthest corner.
     """

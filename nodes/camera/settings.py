@@ -87,7 +87,7 @@ class DeviceSettings:
     """The actual settings of a device.
 
     exposure_s: exposure time; None if unknown.
-    got: text with the format and the settings, for the log and the status of the node.
+    got: text about the format and the settings, for the log and the status of the node.
     warnings: texts about settings that the device did not accept.
     """
 

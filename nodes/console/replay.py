@@ -20,9 +20,10 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """A reader of the state that a recording had at a selected time.
+    """A reader of the last messages before a selected time in a bag.
 
     seconds: selected time since the start of the bag.
+
     Raises BagError if the file is not a bag, or contains no topic that the page shows.
     """
 

@@ -53,6 +53,7 @@ def edit_scene(
     """Change the object's stiffness, the sheet's minimum stretch and the object's size.
 
     size_ratio: size relative to the size in `scene`.
+
     The front of the object stays in place, and the object grows away from the user. A rigid object
     stays rigid. Raises SceneChoiceError if a value is invalid.
     """
@@ -118,9 +119,11 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return the extent (m) of an object's touchable surface from its origin towards the user.
+    """Return the distance (m) from an object's origin to its foremost touchable point.
 
     world_from_object: rotation matrix (3, 3) of the object.
-    The user is in the direction of the world's z axis. The ends of a cylinder are not touchable.
+
+    The distance is measured along the world's z axis, which points to the user. The ends of a
+    cylinder are not touchable.
     """
     return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

@@ -40,9 +40,10 @@ class Sliders:
 class ConsoleState(BaseModel):
     """The saved state of a console.
 
-    base: selected scene. sliders: slider positions; None if no slider was moved. recording: whether
-        a viewer has requested a recording. finger: requested finger position; None if no viewer has
-        moved the finger.
+    base: selected scene.
+    sliders: slider positions; None if no slider was moved.
+    recording: whether a viewer has requested a recording.
+    finger: requested finger position; None if no viewer has moved the finger.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

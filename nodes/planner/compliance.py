@@ -124,7 +124,10 @@ class ObjectCurve:
 
     @classmethod
     def from_rows(cls, rows: Floats) -> ObjectCurve:
-        """Make the curve from an array (n, 2) with the columns depth (m) and force (N)."""
+        """Make the curve from n points.
+
+        rows: array (n, 2) with the depth (m) in column 0 and the force (N) in column 1.
+        """
         return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
 
     def force_n(self, depths_m: Floats) -> Floats:
@@ -152,7 +155,7 @@ class StretchLimits:
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
         """Return the maximum advance (n,) of the sheet towards the finger per depth of the push.
 
-        stiffnesses_n_per_m: stiffnesses (n,) of the sheet.
+        stiffnesses_n_per_m: n stiffnesses (n,) of the sheet.
         """
         result = np.full(len(stiffnesses_n_per_m), MAX_ADVANCE_PER_DEPTH)
         if self.bounds is None:
@@ -212,7 +215,7 @@ class RenderedForce:
 
     @property
     def normal_offset_m(self) -> Floats:
-        """Return the distance (n,), in m, of the sheet behind the object's tangent plane."""
+        """Return the n distances (n,), m, of the sheet behind the object's tangent plane."""
         return self.depths_m - self.indentation_m
 
     @property

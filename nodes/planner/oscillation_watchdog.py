@@ -14,12 +14,12 @@ MIN_AMPLITUDE_M = 2e-4
 """The root mean square amplitude of the depth below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""The ratio of the amplitude in the second half of the window to the amplitude in the first half
-that triggers the watchdog."""
+"""The ratio of two amplitudes that triggers the watchdog. It is the amplitude in the second half of
+the window divided by the amplitude in the first half."""
 
 STEADY_RATIO = 0.95
-"""The ratio of the amplitude in the second half of the window to the amplitude in the first half
-above which an oscillation does not decay."""
+"""The ratio of two amplitudes above which an oscillation does not decay. It is the amplitude in the
+second half of the window divided by the amplitude in the first half."""
 
 SUSTAINED_S = 1.5
 """The time after which an oscillation that does not decay triggers the watchdog."""

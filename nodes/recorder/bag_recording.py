@@ -23,7 +23,7 @@ from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 RETRY_NS = 5_000_000_000
-"""The time from a disk error to the next attempt to start a bag."""
+"""The time (ns) from a disk error to the next attempt to start a bag."""
 
 
 class BagRecording:
@@ -78,7 +78,7 @@ class BagRecording:
         self.check_disk()
 
     def set_requested(self, requested: bool) -> None:
-        """Start a bag if recording is requested, otherwise end the current bag.
+        """Start a bag if recording is requested; otherwise end the current bag.
 
         Disk errors are passed to `on_error`.
         """
