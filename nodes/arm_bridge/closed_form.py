@@ -20,11 +20,11 @@ from flexsheet.nodes.arm_bridge.joint_chain import SerialChain, UnreachableError
 from flexsheet.nodes.arrays import Floats
 
 WRIST_SINGULAR = 1e-7
-"""The value of |sin J5| below which the axes of J4 and J6 count as parallel. J4 then stays fixed.
-"""
+"""The absolute value of sin(J5) below which the axes of J4 and J6 count as parallel. J4 then stays
+fixed."""
 
 SHOULDER_SINGULAR_M = 1e-7
-"""The distance of the wrist centre from the axis of J1 below which J1 stays fixed."""
+"""The distance (m) between the wrist centre and the axis of J1 below which J1 stays fixed."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
 """The absolute values (rad) of the angle J5 that bound the region of the wrist singularity. Below
@@ -89,7 +89,7 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
 
     along, across: components of the vector parallel and perpendicular to the axis.
     fixed: length of the vector at which the axis may deviate by 90 degrees.
-    near: length of the vector from which the axis must not deviate.
+    near: minimum length of the vector at which the axis must not deviate.
 
     In one step, the axis rotates by at most MAX_FREE_ROTATION_RAD more than necessary.
     """
@@ -243,13 +243,13 @@ class ClosedFormKinematics:
         return found
 
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return the solution (6,), rad, of the inverse kinematics nearest to the present angles.
+        """Solve the inverse kinematics with the solution nearest to the present joint angles.
 
         base_from_flange: flange pose (4, 4).
         present_rad: present joint angles (6,).
 
-        The nearest solution is the solution with the smallest maximum joint change. Raises
-        UnreachableError if no solution is within the joint ranges.
+        Returns joint angles (6,), rad. The nearest solution is the solution with the smallest
+        maximum joint change. Raises UnreachableError if no solution is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         nearest, least = None, inf
@@ -379,7 +379,7 @@ class ClosedFormKinematics:
     def find_branch(self, joints_rad: ArrayLike) -> Branch:
         """Return the branch to which joint angles (6,) rad belong.
 
-        At a singularity, where several branches match, the first branch is returned.
+        At a singularity, several branches match, and the first of them is returned.
         """
         joints = np.asarray(joints_rad, dtype=np.float64)
         return Branch(

@@ -63,7 +63,7 @@ from flexsheet.nodes.models.motion import (
 from flexsheet.nodes.models.rigid import is_rigid
 
 MAX_REST_RAD_PER_S = 1e-6
-"""The joint speed up to which an arm is considered to be at rest."""
+"""The maximum joint speed at which an arm is considered to be at rest."""
 
 # At this stretch rate the sheet becomes slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
@@ -78,7 +78,7 @@ MEASURED_SLACK_M = 0.002
 small vibrations of the servos would violate the limits."""
 
 SLACK_STRETCH = 1.0005
-"""The stretch ratio (length / rest length) up to which the sheet is considered slack. At this
+"""The maximum stretch ratio (length / rest length) at which the sheet is considered slack. At this
 ratio, the tension is 0.1 N."""
 
 NO_MOTION = np.zeros(6)
@@ -112,11 +112,12 @@ ALIGNED_RAD = 1e-4
 """The maximum joint motion (rad) that may remain at the end of an alignment (see `path_check`)."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""The tolerance of the joint ranges for measured joint angles. Angles beyond the tolerance are
-treated as measurement errors."""
+"""The tolerance (rad) of the joint ranges for measured joint angles. Angles beyond the tolerance
+are treated as measurement errors."""
 
 RECHECK_PERIOD_S = 0.5
-"""The time after which a blocked path is checked again, because the target may have moved."""
+"""The time (s) after which a blocked path is checked again. The target may have moved in the
+meantime."""
 
 
 @dataclass(frozen=True, slots=True)

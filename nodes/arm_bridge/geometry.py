@@ -110,7 +110,10 @@ class ArmGeometry:
         return self._cached_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
 
     def _solve_flange(self, joints_rad: tuple[float, ...]) -> Floats:
-        """Return the read-only pose base_from_flange (4, 4) at true joint angles (6,) rad."""
+        """Return the flange pose base_from_flange (4, 4), which is read-only.
+
+        joints_rad: joint angles (6,) after correction of the encoder offsets.
+        """
         pose = self.kinematics.forward(np.array(joints_rad))
         pose.flags.writeable = False
         return pose

@@ -33,12 +33,12 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""An angle (rad) between the poses of the sheet that both arms command. If one arm is ahead by more
-than this angle, that arm slows down."""
+"""The lead (rad) above which an arm slows down so that the other arm can catch up. An arm leads if
+its edge is ahead of the other arm's edge on the path to the target."""
 
 WAIT_FROM_RAD = 0.12
-"""An angle (rad) between the poses of the sheet that both arms command. If one arm is ahead by this
-angle, that arm waits. At 0.2 rad, the limiter stops both arms."""
+"""The lead (rad) of an arm at which the arm waits for the other arm. At a lead of 0.2 rad, the
+limiter stops both arms."""
 
 MAX_PREDICTION_S = 0.15
 """The maximum time (s) by which a target's timestamp may be in the future. This time is the sum of
@@ -48,7 +48,7 @@ MAX_TRAJECTORY_S = 0.4
 """The maximum duration (s) of a trajectory that an arm follows even if no new message arrives."""
 
 SKEW_LENGTH_M = 0.25
-"""The offset between two sheet poses that counts as much as a rotation of 1 rad."""
+"""The offset (m) between two sheet poses that counts as much as a rotation of 1 rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,14 +146,14 @@ def make_goal(
 def compute_sync_factor(
     own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool
 ) -> float:
-    """Return the factor (0..1) for this arm's speed that lets the other arm catch up.
+    """Return the speed factor (0..1) with which this arm lets the other arm catch up.
 
     own_edge, other_edge: world poses (4, 4) of the commanded edges.
     target: target pose world_from_sheet (4, 4).
     left: whether this arm holds the left edge.
 
-    A late control cycle of one bridge would twist the sheet. The arm that is ahead on the path to
-    the target therefore slows down in proportion to its lead.
+    If one bridge had a late control cycle, the sheet would be twisted. The arm that is ahead on the
+    path to the target therefore slows down in proportion to its lead.
     """
     across = other_edge[:3, 3] - own_edge[:3, 3]
     half = (0.5 if left else -0.5) * sqrt(float(across @ across))

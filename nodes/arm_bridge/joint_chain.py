@@ -308,7 +308,7 @@ class NumericKinematics:
         return np.asarray(self._max_distance_m - away)
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) of n sets of joint angles (n, 6), rad, from singularities.
+        """Return the margins (n,) between joint angles (n, 6) rad and the nearest singularities.
 
         A margin is the smallest singular value of the Jacobian minus NEAR_SINGULAR_VALUE.
         """

@@ -269,7 +269,7 @@ def _longest(shifts: Floats) -> float:
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
     """Return the largest blend factor (0 to 1) at which no point moves more than `max_shift_m`.
 
-    slow, fast: displacements (n, 3) m of the points for the factors 0 and 1.
+    slow, fast: displacements (n, 3), m, of n points for the factors 0 and 1.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)

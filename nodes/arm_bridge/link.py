@@ -19,7 +19,7 @@ MAX_UNCHANGED_S = 0.05
 ms."""
 
 MIN_PAUSE_S, MAX_PAUSE_S = 0.05, 0.2
-"""The minimum and the maximum pause before a driver opens a failed connection again."""
+"""The minimum and the maximum pause (s) before a driver opens a failed connection again."""
 
 _COUNTER_PERIOD = 2**32
 
@@ -89,9 +89,9 @@ class Freshness(StrEnum):
     FRESH = "fresh"
     """A new measurement, because the counters have advanced."""
     REPEATED = "repeated"
-    """A repeated measurement. The counters have been unchanged for a permitted time."""
+    """A repeated measurement. The counters have been unchanged for at most the permitted time."""
     STALLED = "stalled"
-    """A repeated measurement. The counters have been unchanged for too long a time."""
+    """A repeated measurement. The counters have been unchanged for more than the permitted time."""
     REVERSED = "reversed"
     """A measurement that is older than the previous measurement, because a counter has decreased.
     """
@@ -193,18 +193,18 @@ class ArmLink(Protocol):
 
 
 class ConnectedLink(ABC):
-    """A base class of drivers that send commands over one connection and receive one answer each.
+    """A base class for drivers that send commands over one connection and receive one answer each.
+
+    connections: number of connections that were opened.
 
     A driver implements `connected`, `_connect`, `_request` and `_disconnect`. The base class opens
     the connection, and closes the connection after a failure. The first reconnection is immediate.
     Before each further attempt, the driver waits for a pause. The first pause is MIN_PAUSE_S. Each
     pause is twice as long as the previous one, up to MAX_PAUSE_S.
-
-    connections: number of connections that were opened.
     """
 
     period_s: ClassVar[float] = 0.0071
-    """The period with which the controller measures the joint angles. Answers may repeat a
+    """The period (s) with which the controller measures the joint angles. Answers may repeat a
     measurement for seven periods, or for MAX_UNCHANGED_S if that time is longer."""
 
     def __init__(self, host: str, port: int, *, timeout_s: float) -> None:

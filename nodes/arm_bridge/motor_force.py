@@ -24,7 +24,7 @@ Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 STEP_RAD = 1e-5
 MAX_SPEED_RAD_PER_S = 0.02
 """The maximum joint speed at which the estimate is valid. At higher speeds, sliding friction and
-acceleration change the currents."""
+acceleration change the motor currents."""
 
 PERIOD_NS = 50_000_000
 

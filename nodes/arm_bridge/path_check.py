@@ -128,12 +128,12 @@ def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[Sh
 class Alignment:
     """A straight joint motion that moves one arm to a point on the path of the sheet.
 
-    An alignment is necessary if the arms have stopped with a twisted sheet, or with a joint at the
-    end of its range.
-
     sheet: first pose on the path that both arms can reach.
     from_rad, to_rad: this arm's joint angles (6,) at the start and at the end.
     duration_s: duration, which is equal for both arms; 0 if no motion is necessary.
+
+    An alignment is necessary if the arms have stopped with a twisted sheet, or with a joint at the
+    end of its range.
     """
 
     sheet: SheetMotion
@@ -241,9 +241,9 @@ class PathChecker:
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
         """Return a finished request and its result, or None if no check has finished.
 
-        The caller must call this method in every cycle.
-
         request: path whose check is started if no check is running; None if no check is necessary.
+
+        The caller must call this method in every cycle.
         """
         if self._running is None:
             if request is not None:

@@ -59,8 +59,8 @@ MAX_STEP_RAD = 0.05
 """The maximum change of a joint between two samples of a path."""
 
 MIN_FRACTION = 1e-6
-"""The minimum distance of two samples, as a fraction of the path. If a joint moves by more than
-MAX_STEP_RAD over this distance, its motion is discontinuous."""
+"""The minimum distance between two samples, as a fraction of the path. If a joint moves by more
+than MAX_STEP_RAD over this distance, the joint's motion is discontinuous."""
 
 ROUNDING = 1e-9
 """The tolerance of margins for rounding errors."""
@@ -88,7 +88,7 @@ class SheetPoses:
         )
 
     def without_twists(self) -> SheetPoses:
-        """Return the same poses without twists."""
+        """Return the same poses without velocities."""
         return SheetPoses(self.world_from_sheet, self.stretch_ratio, np.empty((len(self), 0, 6)))
 
 

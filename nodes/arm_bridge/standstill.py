@@ -21,11 +21,11 @@ encoder noise."""
 
 MAX_RESTART_SHIFT_M = 0.005
 """The maximum distance (m) between the commanded and the measured edge at which a motion may
-restart. If the servo lag is at least 15 ms, a moving edge lags by this distance at less than 0.25
+restart. If the servo lag is at least 15 ms, an edge lags by this distance at a speed below 0.25
 m/s."""
 
 JUMP_MARGIN_RAD = 0.002
-"""The tolerance of the plausible joint motion between two measurements."""
+"""The tolerance (rad) of the plausible joint motion between two measurements."""
 
 JUMP_SPEED_RAD_PER_S = 0.5
 """The maximum plausible joint speed of an arm that is not commanded to move. The operator may move

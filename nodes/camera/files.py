@@ -35,7 +35,7 @@ class FileFrame:
 class VideoFile:
     """A video file that is read frame by frame.
 
-    rate_hz: frame rate. If None, the frame times in the file are used.
+    rate_hz: frame rate; None means that the frame times in the file are used.
 
     Raises DeviceError if the file cannot be opened.
     """
@@ -78,7 +78,7 @@ class VideoFile:
 
 
 class FileReader:
-    """A base class of readers of image files. The method `read` never waits."""
+    """A base class for readers of image files. The method `read` never waits."""
 
     paced = True
     rate_hz: float | None = None
@@ -173,9 +173,11 @@ class VideoReader(FileReader):
 class _LoopClock:
     """A clock whose time continues to increase when a file is read again from its start.
 
-    The interval between two passes equals the interval between the last two images of the file.
+    rate_hz: frame rate, which determines the interval between two passes if the file has a single
+        image.
 
-    rate_hz: frame rate, which determines the interval if the file has a single image.
+    Otherwise, the interval between two passes equals the interval between the last two images of
+    the file.
     """
 
     def __init__(self, rate_hz: float) -> None:

@@ -20,7 +20,7 @@ Now = Callable[[], int]
 
 
 class DeviceError(FlexsheetError, RuntimeError):
-    """Raised if a device or file cannot be read, or delivers images of an unexpected size."""
+    """An error for a device or file that cannot be read, or that delivers wrong image sizes."""
 
     code = "device"
     remedy = (
@@ -30,7 +30,10 @@ class DeviceError(FlexsheetError, RuntimeError):
 
 
 class Region(NamedTuple):
-    """A part of a sensor: column and row of its first pixel (from zero), width and height (px)."""
+    """A rectangle of sensor pixels: column and row of the first pixel, width and height (px).
+
+    Columns and rows are counted from zero.
+    """
 
     column: Annotated[int, Field(ge=0)]
     row: Annotated[int, Field(ge=0)]
@@ -59,9 +62,9 @@ class ImagePair:
 
     exposure_ns: mean of both mid-exposure times on the reader's clock. If the source is a file,
         this clock starts at the start of the file.
-    exposure_s: duration of the exposure that the device reports; None if unknown.
+    exposure_s: duration of the exposure that the device reports; None if it is unknown.
     skew_s: mid-exposure time of the right image minus mid-exposure time of the left image.
-    regions: sensor regions of the images; None means full sensors.
+    regions: sensor regions of the images; None means the full sensors.
     notes: remarks for the operator.
     """
 
@@ -114,7 +117,7 @@ def make_stereo_message(
     """Make the message for an image pair.
 
     device: name of the camera.
-    exposure_s: exposure time that is used if the device reports none.
+    exposure_s: exposure time that is used if the device reports no exposure time.
     """
     origins = [(region.column, region.row) for region in images.regions or ()] or [(0, 0)] * 2
     return StereoPair(
@@ -150,7 +153,7 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 
 
 def describe_skew(skew_s: float, limit_s: float) -> str:
-    """Return the reason for the rejection of an image pair, as text.
+    """Return a text that states why an image pair is rejected.
 
     skew_s: time between the left and the right exposure.
     limit_s: maximum permitted time.

@@ -153,7 +153,7 @@ class Camera(Node):
     def _publish(self, images: ImagePair, device: str, exposure_s: float, lost: int) -> None:
         """Publish an image pair, unless its two exposures are too far apart in time.
 
-        exposure_s: exposure time that is used if the device reports none.
+        exposure_s: exposure time that is used if the device reports no exposure time.
         lost: total number of lost frames, without the frames of rejected pairs.
         """
         limit_s = self.parameters.max_skew_s

@@ -17,12 +17,13 @@ points, the change of the lens distortion is negligible."""
 MARGIN_PX = 16.0
 """The margin around a region, which allows for blur of the marker and for calibration errors."""
 ALIGN_PX = (16, 2)
-"""The column and row numbers at which a region starts must be multiples of these numbers."""
+"""The alignment of a region. The numbers of its first column and row must be multiples of these two
+numbers."""
 NEAREST_M = 1e-3
 
 
 class ExplicitRegions(LimitedModel):
-    """The sensor regions in a launch file: [column, row, width, height] (px) of each view."""
+    """The sensor region of each view in a launch file, as [column, row, width, height] in px."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

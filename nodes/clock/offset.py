@@ -37,7 +37,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """An estimate of the time of another clock minus the time of the local clock.
+    """An estimate of a clock offset: the time of another clock minus the time of the local clock.
 
     drift_ratio: estimated rate of change of the offset.
 

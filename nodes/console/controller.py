@@ -321,7 +321,7 @@ class ConsoleFiles:
 
 
 class ReleaseError(FlexsheetError, ValueError):
-    """An error that is raised if the host of the console is not permitted to reset an e-stop.
+    """An error for a reset of an e-stop from a host that is not permitted to reset e-stops.
 
     The text names the hosts that are permitted to reset the e-stop.
     """

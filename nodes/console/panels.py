@@ -17,8 +17,8 @@ from flexsheet.nodes.console.controller import EyeViewState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_RATIO = 0.5
-"""The fraction of a topic's minimum rate; if the actual rate is below it, the topic is shown as
-slow."""
+"""The minimum ratio of a topic's actual rate to its minimum rate. If the ratio is lower, the topic
+is shown as slow."""
 
 MAX_STATUS_AGE_S = 3.0
 """The maximum age (s) of a node's last status message. If the message is older, the node is shown

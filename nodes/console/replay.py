@@ -20,7 +20,7 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """A reader of the last messages before a selected time in a bag.
+    """A reader of the last message of each topic up to a selected time in a bag.
 
     seconds: selected time since the start of the bag.
 
@@ -46,7 +46,10 @@ class Timeline:
         self.seconds = 0.0
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the last message of a topic at or before the selected time, or None."""
+        """Return the last message of a topic at or before the selected time.
+
+        The result is None if there is no such message.
+        """
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:
@@ -77,9 +80,9 @@ class Timeline:
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
-        """Return the messages of a chunk by channel and log time (ns).
+        """Return the messages of a chunk of the bag by channel and log time (ns).
 
-        Recently read chunks are cached.
+        Chunks that were read recently are cached.
         """
         cached = self._chunks.get(chunk.offset)
         if cached is None:

@@ -387,7 +387,10 @@ def make_line_segments(points: Floats) -> Floats:
 
 
 def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Return n vertices (n, 3), m, and t triangles (t, 3) of a fingertip with its tip at zero."""
+    """Return the mesh of a fingertip whose tip is at the origin.
+
+    The mesh has n vertices (n, 3), m, and t triangles (t, 3).
+    """
     tilt = np.linspace(0.0, 0.5 * np.pi, 8)
     radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m, 0.0]])
     ends = [FINGER_LENGTH_M, FINGER_LENGTH_M + 0.4 * radius_m]

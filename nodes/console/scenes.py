@@ -21,7 +21,7 @@ MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """An error that is raised if a scene cannot be used."""
+    """An error for a scene that cannot be used."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
@@ -119,7 +119,7 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return the distance (m) from an object's origin to its foremost touchable point.
+    """Return how far (m) an object's touchable surface extends from its origin to the user.
 
     world_from_object: rotation matrix (3, 3) of the object.
 

@@ -56,11 +56,11 @@ FORCE_JND_FLOOR_N = 0.05
 """
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""The contact forces between which the sheet's advance increases from zero to its full value. The
-contact force is the larger of two forces: the object's force and the sheet's force."""
+"""The contact forces (N) between which the sheet's advance increases from zero to its full value.
+The contact force is the larger of two forces: the object's force and the sheet's force."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
-"""The depths between which the sheet's advance increases from zero to its full value."""
+"""The depths (m) between which the sheet's advance increases from zero to its full value."""
 
 TARGET_ERROR_RATIO = 0.10
 """The relative error of the rendered force above which the planner reports the error."""

@@ -230,7 +230,7 @@ class ContactStateMachine:
         """Roll the sheet on the object until the contact is at the surface point `found`.
 
         The contact stays within the usable area of the sheet. The second result is the limit that
-        stops the contact earlier, or None if no limit does.
+        stops the contact before this point, or None if no limit does.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])

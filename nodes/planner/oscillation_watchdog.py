@@ -103,7 +103,8 @@ class OscillationWatchdog:
 def _oscillates(depths: np.ndarray) -> bool:
     """Return whether n depths (n,), m, change their sign at least twice.
 
-    The depths of a single push do not. Values smaller than MIN_AMPLITUDE_M are ignored.
+    The depths of a single push change their sign less often. Values smaller than MIN_AMPLITUDE_M
+    are ignored.
     """
     large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
     return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

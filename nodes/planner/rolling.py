@@ -124,7 +124,7 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     rate: velocity (3,) m/s of the contact on the object.
 
     The twist consists of linear velocity (m/s) and angular velocity (rad/s). The angular velocity
-    is n x dn/dt with the normal n. The sheet's point in contact is at rest.
+    is n x dn/dt with the surface normal n. The point of the sheet in contact is at rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)

@@ -15,7 +15,7 @@ from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPush
 
 MAX_STIFFNESS_RATIO = 0.05
 """The maximum relative difference between the stiffness in the scene and the calibrated stiffness.
-It equals three standard deviations of a calibration."""
+It equals three standard deviations of a calibrated stiffness."""
 
 
 def check_stiffness(

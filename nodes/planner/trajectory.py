@@ -194,7 +194,7 @@ class SheetTrajectoryPlanner:
 
     @property
     def in_contact(self) -> bool:
-        """Return whether the last valid finger position was in contact."""
+        """Return whether the finger touched the sheet at the last valid finger position."""
         return self._command.phase in ("contact", "hold")
 
     def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:

@@ -29,13 +29,13 @@ RETRY_NS = 5_000_000_000
 class BagRecording:
     """A recorder that writes messages to bags while recording is requested.
 
-    A bag is closed when the free disk space falls to `keep_free_bytes`. The remaining space
-    suffices for the index of the bag. When twice as much space is free again, a new bag starts with
-    the last messages of all latched topics. Disk errors during writing are passed to `on_error` and
-    not raised.
-
     note: state of the recording, as one line of text.
     lost: number of messages that were lost since the last bag.
+
+    A bag is closed when the free disk space falls to `keep_free_bytes`. The remaining space is
+    sufficient for the index of the bag. When twice as much space is free again, a new bag starts
+    with the last messages of all latched topics. Disk errors during writing are passed to
+    `on_error` and not raised.
     """
 
     def __init__(
