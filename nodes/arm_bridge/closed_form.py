@@ -195,7 +195,7 @@ class ClosedFormKinematics:
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return how far n flange poses (n, 4, 4) are within the arm's maximum reach, as (n,), m.
+        """Return how far (m) n flange poses (n, 4, 4) are within the maximum reach, as (n,).
 
         The value is negative if a pose is out of reach.
         """

@@ -74,7 +74,10 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class SeedBranch(NamedTuple):
-    """A branch of an arm whose kinematics have no closed form, defined by one joint solution."""
+    """A branch of an arm whose kinematics have no closed form.
+
+    One set of joint angles defines the branch.
+    """
 
     seed_rad: tuple[float, ...]
 
@@ -299,7 +302,7 @@ class NumericKinematics:
         return float(self._chain.offsets_m.sum() + self._chain.flange_m)
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return how far n flange poses (n, 4, 4) are within the arm's maximum reach, as (n,), m.
+        """Return how far (m) n flange poses (n, 4, 4) are within the maximum reach, as (n,).
 
         The maximum reach is the sum of all link lengths. The value is negative if a pose is out of
         reach.

@@ -83,7 +83,10 @@ class LineLink(ConnectedLink):
                     self.host, self.port, limit=MAX_LINE_BYTES
                 )
         except OSError as error:
-            raise ArmSilentError(f"no connection to {self.host}:{self.port}: {error}") from error
+            raise ArmSilentError(
+                f"no connection to {self.host}:{self.port}: {error}; "
+                "check the controller and the network cable"
+            ) from error
 
     async def _request(
         self, mode: str, joints_rad: Floats, now_ns: int

@@ -216,7 +216,10 @@ class ModbusLink(ConnectedLink):
         client.ctx.framer = self._framer
         if not await client.connect():
             client.close()
-            raise ArmSilentError(f"no connection to {self.host}:{self.port}")
+            raise ArmSilentError(
+                f"no connection to {self.host}:{self.port}; "
+                "check the controller and the network cable"
+            )
         self._client = client
 
     async def _request(
@@ -240,7 +243,8 @@ class ModbusLink(ConnectedLink):
                     f"the answer of {self.host}:{self.port} is not Modbus"
                 ) from error
             raise ArmSilentError(
-                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
+                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms; "
+                "check the controller and the network cable"
             ) from error
         if answer.isError():
             code = getattr(answer, "exception_code", "?")

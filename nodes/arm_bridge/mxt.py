@@ -202,7 +202,8 @@ class MxtLink:
                 status = await self._receive(link)
         except TimeoutError as error:
             raise ArmSilentError(
-                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
+                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms; "
+                "check the controller and the network cable"
             ) from error
         except OSError as error:
             raise ArmSilentError(f"{self.host}:{self.port}: {error.strerror}") from error

@@ -66,7 +66,7 @@ class VideoFile:
             if time_ns <= self._newest_ns:
                 raise DeviceError(
                     f"{self.path}: the time of frame {self._number}, {time_ms:g} ms, is not after "
-                    "that of the previous frame; set rate_hz of the camera node's source"
+                    "the time of the previous frame; set rate_hz of the camera node's source"
                 )
         self._number += 1
         self._newest_ns = time_ns
@@ -128,7 +128,10 @@ class VideoReader(FileReader):
             self._clock.restart()
             frames = self._next()
             if frames is None:
-                raise DeviceError(f"{self._source.left}: the video contains no image pair")
+                raise DeviceError(
+                    f"{self._source.left}: the video contains no image pair; correct the camera "
+                    "node's source"
+                )
         if frames is None:
             return None
         notes = ["frame times of the file" if self._source.rate_hz is None else "at the set rate"]

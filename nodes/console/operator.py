@@ -364,7 +364,7 @@ class Operator:
 
     def _open_bag(self, name: str) -> None:
         if name == NO_BAG:
-            raise ValueError("there is no bag; record one first")
+            raise ValueError("there is no bag; record a bag first")
         self.controller.replay.open(name)
         self._page.record.show_replay(self.controller.replay, opened=True)
 

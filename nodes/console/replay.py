@@ -74,8 +74,8 @@ class Timeline:
         record = self._records(chunks[i]).get((self._channels[name], times[i]))
         if record is None:
             raise BagError(
-                f'{self.path}: topic "{name}": the index of the bag refers to a missing message; '
-                "the file is damaged, choose another bag"
+                f'{self.path}: topic "{name}": the index of the bag refers to a missing message, '
+                "so the file is damaged; choose another bag"
             )
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 

@@ -76,8 +76,8 @@ def edit_scene(
         if stretch_ratio > limit + STRETCH_STEP:
             raise SceneChoiceError(
                 f"tension: {100 * (stretch_ratio - 1):.1f} % is above {100 * (limit - 1):.1f} %, "
-                "the limit by max_stretch_ratio and max_edge_force_n of the scene's sheet; lower "
-                "the tension"
+                "the maximum that max_stretch_ratio and max_edge_force_n of the scene's sheet "
+                "permit; lower the tension"
             )
         values["sheet"] = _with(sheet, min_stretch_ratio=min(stretch_ratio, limit))
         return Scene(**values)

@@ -119,7 +119,9 @@ class ObjectCurve:
                 "0 m, 0 N"
             )
         if (np.diff(depths) <= 0.0).any() or (np.diff(forces) < 0.0).any():
-            raise UnfitCurveError("force curve: the depths must ascend, the forces must not fall")
+            raise UnfitCurveError(
+                "force curve: the depths must ascend, and the forces must not fall"
+            )
         object.__setattr__(self, "_curve", scipy.interpolate.PchipInterpolator(depths, forces))
 
     @classmethod

@@ -72,7 +72,8 @@ class BagRecording:
             self._path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BagError(
-                f"{self._path.parent}: the folder cannot be created: {error.strerror}"
+                f"{self._path.parent}: the folder cannot be created: {error.strerror}; "
+                "correct the path of the bag, or the permissions"
             ) from error
         self._start_bag()
         self.check_disk()
