@@ -102,8 +102,8 @@ class Family:
     trials: function that yields the trials of all methods over a scene's working range. A trial
         must be run before the next trial is requested.
     tolerance: function that returns the scene's tolerance for the error, in `unit`.
-    sweep_key: key of a property of the cases. A separate plot shows the errors against this
-        property. If None, there is no such plot.
+    sweep_key: key of a property of the cases; a separate plot shows the errors against this
+        property. None means that there is no such plot.
     prepare: function that computes and caches the data for `trials`, and reports its progress.
     """
 

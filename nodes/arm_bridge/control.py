@@ -328,7 +328,7 @@ class ArmControl:
     def on_estop(
         self, estop: EStop, stamp_ns: int, now_ns: int, clock_problem: str = ""
     ) -> str | None:
-        """Engage or reset the e-stop; return why a reset is refused, or None if nothing is refused.
+        """Engage or reset the e-stop; return the reason if a reset is refused, otherwise None.
 
         stamp_ns: timestamp of the message.
         clock_problem: reason why the timestamp is uncertain; empty if the timestamp is certain.
@@ -363,7 +363,7 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm; return why the command is refused, or None if it is accepted.
+        """Arm or disarm the arm; return the reason if the command is refused, otherwise None.
 
         age_s: age of the operator's command.
         """

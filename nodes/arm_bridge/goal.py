@@ -33,12 +33,13 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""The lead (rad) above which an arm slows down so that the other arm can catch up. An arm leads if
-its edge is ahead of the other arm's edge on the path to the target."""
+"""The lead (rad) above which an arm slows down so that the other arm can catch up. The lead is the
+rotation by which an arm is ahead on the path to the target. `SKEW_LENGTH_M` converts an offset to a
+rotation."""
 
 WAIT_FROM_RAD = 0.12
-"""The lead (rad) of an arm at which the arm waits for the other arm. At a lead of 0.2 rad, the
-limiter stops both arms."""
+"""The lead (rad) at which an arm waits for the other arm (see `SLOW_FROM_RAD`). At a lead of 0.2
+rad, the limiter stops both arms."""
 
 MAX_PREDICTION_S = 0.15
 """The maximum time (s) by which a target's timestamp may be in the future. This time is the sum of

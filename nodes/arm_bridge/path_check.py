@@ -191,7 +191,7 @@ def _check_alignment(
 
     begin, there: joint angles of both arms at the start and at the end.
 
-    If a limit is already violated at the start, the limit is widened.
+    A limit that is already violated at the start is widened.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)

@@ -116,7 +116,7 @@ class VideoReader(FileReader):
         self._pairing = Pairing(1.0 / rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair, or None at the end of the video.
+        """Return the next image pair, or None if the end of the video has been reached.
 
         Raises DeviceError if a file is faulty.
         """
@@ -153,7 +153,7 @@ class VideoReader(FileReader):
     def _next(self) -> tuple[FileFrame, ...] | None:
         """Return the two frames of the next image pair, or one frame that contains both views.
 
-        Returns None at the end of a file.
+        Returns None if the end of a file has been reached.
         """
         if len(self._files) == 1:
             (file,) = self._files

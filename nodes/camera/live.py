@@ -294,7 +294,7 @@ class CameraReader:
     def _describe_silence(self, counts: list[int]) -> str:
         """Return an error text with the reason why no image pair arrived.
 
-        counts: number of frames of each camera at the start of the wait.
+        counts: number of frames that each camera had delivered when the wait began.
         """
         silent = [
             repr(stream.device)

@@ -98,7 +98,7 @@ def find_finger_regions(scene: Scene) -> Regions:
 
 
 def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | None:
-    """Return the sensor regions to publish, or None for both full sensors.
+    """Return the sensor regions to publish, or None if both full sensors are published.
 
     setting: "full", "finger" (the regions in which the finger can appear), or explicit regions.
 

@@ -53,10 +53,10 @@ class SurfacePicker:
         origin: origin (3,), m, of the ray in the world frame.
         direction: direction (3,) of the ray in the world frame, which is not zero.
 
-        The ray selects the surface point where it meets the object. If it misses the object, it
-        selects the surface point nearest to the ray. The fingertip is `depth_m` below this point
-        along the normal; a negative depth is above the surface. The point and the depth are limited
-        to the working range.
+        The ray selects the surface point where it meets the object. If the ray misses the object,
+        the surface point nearest to the ray is selected. The fingertip is `depth_m` below the
+        selected point along the normal. If the depth is negative, the fingertip is above the
+        surface. The point and the depth are limited to the working range.
         """
         direction = direction / np.linalg.norm(direction)
         travelled, nearest_m, nearest = 0.0, np.inf, origin

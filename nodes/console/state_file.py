@@ -55,7 +55,7 @@ class ConsoleState(BaseModel):
 
 
 def load_state(path: Path) -> ConsoleState | None:
-    """Read the saved state of a console; return None if there is no file.
+    """Read the saved state of a console; return None if the file does not exist.
 
     Raises SceneChoiceError if the file is invalid.
     """

@@ -320,7 +320,7 @@ class RecordTab:
     def show_bags(self, names: Sequence[str], recorded: str | None = None) -> None:
         """List the bags in the selection control.
 
-        recorded: bag that has just been recorded, which is then selected; None selects no bag.
+        recorded: bag that has just been recorded; this bag is selected. None selects no bag.
         """
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:

@@ -94,9 +94,8 @@ class UnfitCurveError(FlexsheetError, ValueError):
 class ObjectCurve:
     """The force of an object as a function of depth, given by n points that start at (0, 0).
 
-    The depths and the forces of the points must ascend. The curve is a monotone cubic between the
-    points, and a line beyond the last point. Raises UnfitCurveError if the points are not finite or
-    not ascending.
+    The curve is a monotone cubic between the points, and a line beyond the last point. Raises
+    UnfitCurveError if a point is not finite, if the depths do not ascend, or if the forces fall.
     """
 
     depths_m: Floats
@@ -243,8 +242,8 @@ between the control points bound the slope of the spline. Bounds that hold at th
 hold at all depths."""
 
 SATURATION_FRACTION = 0.1
-"""The fraction of the maximum indentation that is left when the indentation begins to approach the
-maximum smoothly."""
+"""The fraction of the maximum indentation over which the indentation approaches its maximum
+smoothly."""
 
 
 def render_force(

@@ -31,10 +31,12 @@ class MonotonicTimestampFilter:
         self._late_ns: list[int] = []
 
     def update(self, source_ns: int, first_step_s: float) -> float | None:
-        """Return the time (s) since the last accepted fingertip, or None if this one is dropped.
+        """Return the time (s) since the last accepted fingertip, or None if it is too late.
 
         source_ns: time of the exposure.
         first_step_s: result for the first fingertip and after a restart.
+
+        If the result is None, the new fingertip must be dropped.
         """
         last_ns = self._last_ns
         if last_ns is not None and source_ns < last_ns + MIN_STEP_NS:
