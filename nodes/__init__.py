@@ -72,9 +72,7 @@ NODES: dict[str, str] = {
 
 
 class UnknownNodeError(FlexsheetError, KeyError):
-    """Raised for a node type that is not in `NODES`. The error text suggests a similar node
-    type.
-    """
+    """An error for a node type that is not in `NODES`. The error text suggests a similar type."""
 
     code = "unknown-node"
     remedy = "`flexsheet node types` prints all names."
@@ -84,8 +82,8 @@ def node_class(name: str) -> type[Node]:
     """Import and return the class of a node type, which is a name in `NODES` or "module:Class".
 
     The package name may be missing, as in "nodes.planner.node:Planner" in old launch files and
-    bags. Raises UnknownNodeError for an unknown name, ImportError for a missing module, and
-    AttributeError for a missing class.
+    bags. Raises UnknownNodeError if the name is unknown, ImportError if the module is missing, and
+    AttributeError if the class is missing.
     """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")

@@ -28,8 +28,8 @@ DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile
 """The exceptions that can occur when a damaged file, or a file of another program, is read."""
 
 CACHED_S = 1.0
-"""The time after the start, in seconds, in which finished steps count as loaded from the cache. The
-estimate of the remaining time ignores these steps."""
+"""The time (s) after the start of a computation. Steps that finish within this time count as loaded
+from the cache, and the estimate of the remaining time ignores them."""
 MINUTE_S = 60.0
 
 
@@ -51,8 +51,8 @@ class Specification(Generic[T]):
     kind: first part of the file name.
     depends_on: JSON value of all inputs, including the version of the code that computes the
         result.
-    decode: function from arrays to the result, which raises one of the exceptions `DAMAGE` for
-        invalid arrays.
+    decode: function from arrays to the result. It raises one of the exceptions in `DAMAGE` if the
+        arrays are invalid.
     """
 
     kind: str
@@ -78,9 +78,10 @@ class Specification(Generic[T]):
 
 
 def cached(specification: Specification[T], cache_dir: Path | None, compute: Callable[[], T]) -> T:
-    """Return the cached result. If there is none, compute and store it, and delete its checkpoints.
+    """Return the cached result, or compute and store the result if the cache does not contain it.
 
-    Raises OSError if the result cannot be written, and the exceptions that `compute` raises.
+    After a computation, the checkpoints are deleted. Raises OSError if the result cannot be
+    written, and the exceptions that `compute` raises.
     """
     result = load_cached(specification, cache_dir)
     if result is None:
@@ -107,8 +108,9 @@ def load_cached(specification: Specification[T], cache_dir: Path | None) -> T | 
 
 
 def save_cached(specification: Specification[T], cache_dir: Path | None, result: T) -> Path:
-    """Store a result, and return the path of its file. Raises OSError if the file cannot be
-    written.
+    """Store a result, and return the path of its file.
+
+    Raises OSError if the file cannot be written.
     """
     path = specification.path(cache_dir)
     save_arrays(path, specification.encode(result))
@@ -204,8 +206,9 @@ class CheckpointStore:
 
 
 class EtaEstimator:
-    """An estimator of the remaining time of a long computation, from the number of finished
-    steps.
+    """An estimator of the remaining time of a long computation.
+
+    The estimate uses the number of finished steps.
     """
 
     def __init__(self) -> None:

@@ -34,7 +34,7 @@ class Rejection(StrEnum):
 
 
 class RejectedError(ValueError):
-    """Raised for an external message that must not enter the graph."""
+    """An error for an external message that must not enter the graph."""
 
     def __init__(self, reason: Rejection) -> None:
         super().__init__(reason.value)
@@ -72,10 +72,11 @@ def rotate_x_axis(quaternion: Floats) -> Floats:
 def make_eye(centre_world_m: Floats, right_world: Floats, scene: Scene) -> Eye:
     """Make a message with the position of the user's eyes.
 
-    centre_world_m (3,): midpoint of the eyes.
-    right_world (3,): unit vector from the left to the right eye.
+    centre_world_m: midpoint (3,) of the eyes.
+    right_world: unit vector (3,) from the left to the right eye.
 
-    Raises RejectedError if the position is not finite, or too far from the scene's position.
+    Raises RejectedError if the position is not finite, or too far from the eye position in the
+    scene.
     """
     check_finite(centre_world_m)
     if np.linalg.norm(centre_world_m - scene.eyes.centre_world_m) > MAX_EYE_OFFSET_M:

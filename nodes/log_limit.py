@@ -36,8 +36,8 @@ class RepeatLimiter:
     """A structlog processor that passes only the 1st, 10th, 100th, ... of equal log records.
 
     In addition, one repeated record passes every REPORT_PERIOD_S seconds. Records that differ only
-    in numbers count as equal. Repeated records that pass contain the number of occurrences since
-    the start of the node as `count`.
+    in numbers count as equal. In each repeated record that passes, `count` is the number of
+    occurrences since the start of the node.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:

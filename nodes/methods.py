@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Scene
 
 MAX_TRIAL_S, MIN_REPEATS = 3.0, 3
-"""The time (s) after which a trial is not repeated further, and the minimum number of
-repetitions."""
+"""The time (s) after which a trial is not repeated further, and the minimum number of repetitions.
+"""
 
 NORMAL_95 = 1.96
 """The half-width of the central 95 % interval of a normal distribution, in standard deviations."""
@@ -40,7 +40,7 @@ class Interval:
 
 
 def estimate_rms(errors: NDArray[np.float64]) -> Interval:
-    """Estimate the root mean square of independent errors (n,), with its confidence interval.
+    """Estimate the root mean square of n independent errors (n,), with its confidence interval.
 
     The interval is computed from the spread of the squared errors.
     """
@@ -54,8 +54,8 @@ def estimate_rms(errors: NDArray[np.float64]) -> Interval:
 def estimate_median(values: Sequence[float]) -> Interval:
     """Estimate the median of values, with its confidence interval.
 
-    The limits of the interval are order statistics. For fewer than 6 values, they are the minimum
-    and the maximum.
+    The limits of the interval are order statistics. If there are fewer than 6 values, the limits
+    are the minimum and the maximum.
 
     Source: Conover, Practical Nonparametric Statistics, 1999, section 3.2.
     """
@@ -102,8 +102,8 @@ class Family:
     trials: function that yields the trials of all methods over a scene's working range. A trial
         must be run before the next trial is requested.
     tolerance: function that returns the scene's tolerance for the error, in `unit`.
-    sweep_key: key of a property of the cases. A separate plot shows the errors against this
-        property. If None, there is no such plot.
+    sweep_key: key of a property of the cases; a separate plot shows the errors against this
+        property. None means that there is no such plot.
     prepare: function that computes and caches the data for `trials`, and reports its progress.
     """
 

@@ -1,5 +1,6 @@
-"""Define the base class of nodes. Ports are declared as annotations, and handlers are methods that
-are named after ports.
+"""Define the base class of nodes.
+
+In a subclass, annotations declare the ports, and methods that are named after ports are handlers:
 
     class Follower(Node):
         "Publish a sheet target 10 cm above the finger."
@@ -125,7 +126,10 @@ class ExecutionLog:
         self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
 
     def drain(self) -> NDArray[np.int64]:
-        """Return the rows (n, 4) of the log, and delete the rows after RESEND_NS from the start."""
+        """Return the n rows (n, 4) of the log.
+
+        If RESEND_NS has passed since the start, the rows are deleted from the log.
+        """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
         if self._clock.now_ns() > self._started_ns + RESEND_NS:
             self._rows.clear()
@@ -135,11 +139,11 @@ class ExecutionLog:
 class Input(Generic[M]):
     """A subscribed topic with its latest message, header and counters.
 
-    All timestamps are converted to this host's clock.
-
-    clock_problem: reason why the conversion is not reliable, or "" if it is.
+    clock_problem: reason why the conversion of timestamps is not reliable, or "" if it is.
     has_ended: whether the connection to the writer has ended since the last message; updated only
         for the `watched_inputs` of a node.
+
+    All timestamps are converted to this host's clock.
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -155,10 +159,8 @@ class Input(Generic[M]):
     def age_s(self) -> float:
         """Return the time (s) since the source timestamp of the latest message.
 
-        The time is infinite before the first message.
-
-        If the offset of the sender's clock is unknown, return the time since the message was
-        received.
+        The time is infinite before the first message. If the offset of the sender's clock is
+        unknown, the result is the time since the message was received.
         """
         if self.header is None:
             return float("inf")
@@ -319,8 +321,9 @@ class Node:
     them."""
 
     async def settle(self) -> None:
-        """Wait until the work that handlers have started is finished. A replay calls this method
-        after each step.
+        """Wait until the work that handlers have started is finished.
+
+        A replay calls this method after each step.
         """
 
     @classmethod
@@ -449,8 +452,9 @@ class Node:
         return getattr(self, f"on_{port}", None)
 
     def deliver(self, port: str, message: Message, header: Header) -> None:
-        """Store a message in its input, and call its handler. A coroutine handler runs in a
-        separate task.
+        """Store a message in its input, and call its handler.
+
+        A coroutine handler runs in a separate task.
         """
         message, header, clock_problem = self._localise(message, header)
         self.inputs[port].has_ended = False

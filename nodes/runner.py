@@ -176,8 +176,9 @@ class NodeTransport:
                 self._open_stop_socket(node, config.port)
 
     def _open_stop_socket(self, node: Node, port: str) -> None:
-        """Open a socket for e-stops from tools, which also works if the launcher does not
-        respond.
+        """Open a socket for e-stops from tools.
+
+        The socket also works if the launcher does not respond.
         """
 
         def stop(reason: str) -> None:
@@ -430,8 +431,9 @@ class Heartbeat:
 
 
 class LoggedNodeError(Exception):
-    """Raised after the failure of a node. The failure is already logged with the name of the
-    node.
+    """An error that is raised after the failure of a node.
+
+    The failure is already logged with the name of the node.
     """
 
 

@@ -12,14 +12,14 @@ from contextlib import contextmanager
 def handle_signals(
     handler: Callable[[], object], *numbers: int, ignore_afterwards: bool = False
 ) -> Iterator[None]:
-    """Call `handler` in the running event loop for each of the given signals, until the context
-    exits.
+    """Call `handler` in the running event loop for each of the given signals.
 
     ignore_afterwards: whether to ignore the signals after the context instead of restoring their
-        former actions. Use it in a process that ends after its clean-up.
+        former actions. True is intended for a process that ends after its clean-up.
 
-    When the event loop removes its handler of SIGINT, it installs Python's default, which raises an
-    exception. Therefore the signals are blocked until the former actions are restored.
+    The handler is active until the context exits. When the event loop removes its handler of
+    SIGINT, it installs Python's default, which raises an exception. Therefore the signals are
+    blocked until the former actions are restored.
     """
     loop = asyncio.get_running_loop()
     former = {number: signal.getsignal(number) for number in numbers}

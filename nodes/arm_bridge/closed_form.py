@@ -1,8 +1,9 @@
 """Compute the kinematics of 6-axis arms with a spherical wrist in closed form.
 
-At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z. Joint angles are arrays
-(6,), in radians. Poses are 4x4 matrices `base_from_flange`, in metres. A branch is one of up to
-eight solutions of a pose for the joint angles. `ClosedFormArm` in the scene defines the dimensions.
+J1 to J6 are the joints, counted from the base. At joint angles of zero, they rotate about the axes
+z, y, y, z, y, z. Joint angles are arrays (6,), in radians. Poses are 4x4 matrices
+`base_from_flange`, in metres. A branch is one of up to eight solutions of the inverse kinematics
+for one flange pose. The class `ClosedFormArm` of the scene defines the dimensions.
 """
 
 from __future__ import annotations
@@ -19,28 +20,30 @@ from flexsheet.nodes.arm_bridge.joint_chain import SerialChain, UnreachableError
 from flexsheet.nodes.arrays import Floats
 
 WRIST_SINGULAR = 1e-7
-"""The value of |sin J5| below which the axes of J4 and J6 count as parallel. J4 then stays fixed.
-"""
+"""The absolute value of sin(J5) below which the axes of J4 and J6 count as parallel. J4 then stays
+fixed."""
 
 SHOULDER_SINGULAR_M = 1e-7
-"""The distance of the wrist centre from the axis of J1 below which J1 stays fixed."""
+"""The distance (m) between the wrist centre and the axis of J1 below which J1 stays fixed."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""The values of |J5| that bound the region of the wrist singularity. Below the first value, J4 may
-stay constant. Below the second value, J4 may deviate from its exact value."""
+"""The absolute values (rad) of the angle J5 that bound the region of the wrist singularity. Below
+the first value, J4 may stay constant. Below the second value, J4 may deviate from the solution of
+the inverse kinematics."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""The distances between wrist centre and J1 axis that bound the region of the shoulder singularity.
-Below the first distance, J1 may stay constant. Below the second distance, J1 may deviate from its
-exact value."""
+"""The distances (m) between the wrist centre and the J1 axis that bound the region of the shoulder
+singularity. Below the first distance, J1 may stay constant. Below the second distance, J1 may
+deviate from the solution of the inverse kinematics."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
-"""The maximum pose error near a singularity, divided by WRIST_FIXED_RAD or SHOULDER_FIXED_M. The
-maximum errors are 1.05 degrees and 1 mm."""
+"""The ratio of the maximum pose error near a singularity to WRIST_FIXED_RAD or SHOULDER_FIXED_M.
+The resulting maximum errors are 1.05 degrees and 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
-"""The maximum rotation of J4 or J1 in one step to reduce the pose error near a singularity. At 140
-steps per second, the rotation speed is half the maximum speed of these joints."""
+"""The maximum rotation (rad) of J4 or J1 in one step that only reduces the pose error near a
+singularity. At 140 steps per second, this rotation corresponds to half the maximum speed of these
+joints."""
 
 Shoulder = Literal["front", "back"]
 Elbow = Literal["up", "down"]
@@ -70,10 +73,10 @@ BRANCHES = tuple(
 
 
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
-    """Return the rotation matrix (3, 3) of the forearm.
+    """Return the rotation matrix (3, 3) of the forearm relative to the base.
 
-    joint_1: angle of J1 about z, rad.
-    joints_23: sum of the angles J2 and J3 about y, rad.
+    joint_1: angle of J1 about the z axis, rad.
+    joints_23: sum of the angles of J2 and J3 about the y axis, rad.
     """
     c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
     return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
@@ -85,8 +88,10 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
     Near a singularity, the vector is short, and the axis may deviate from the vector.
 
     along, across: components of the vector parallel and perpendicular to the axis.
-    fixed, near: lengths of the vector at which the permitted deviation is 90 degrees and zero. The
-        deviation is reduced by at most MAX_FREE_ROTATION_RAD per step.
+    fixed: length of the vector at which the axis may deviate by 90 degrees.
+    near: minimum length of the vector at which the axis must not deviate.
+
+    In one step, the axis rotates by at most MAX_FREE_ROTATION_RAD more than necessary.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -101,9 +106,9 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
 
 
 def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
-    """Return the angle of J6 (rad) for which J4, J5 and J6 best approximate a rotation.
+    """Return the angle of J6 (rad) at which J4, J5 and J6 best approximate a desired rotation.
 
-    wrist: rotation matrix (3, 3) from the forearm to the flange.
+    wrist: desired rotation matrix (3, 3) from the forearm to the flange.
     q4, q5: angles of J4 and J5, rad.
     """
     s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
@@ -151,9 +156,9 @@ class ClosedFormKinematics:
         """The maximum distance (m) of the wrist centre from the shoulder within the range of J3."""
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (n, 6, 6) in the base frame at joint angles (n, 6) rad.
+        """Return the Jacobians (n, 6, 6) in the base frame for n sets of joint angles (n, 6), rad.
 
-        The Jacobian maps joint speeds to the linear and then the angular velocity of the flange.
+        A Jacobian maps joint speeds to the linear and then the angular velocity of the flange.
         """
         return self._chain.jacobian(joints_rad)
 
@@ -190,9 +195,9 @@ class ClosedFormKinematics:
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return the distances (n,), m, of flange poses (n, 4, 4) from the arm's maximum reach.
+        """Return how far (m) n flange poses (n, 4, 4) are within the maximum reach, as (n,).
 
-        A distance is positive within reach.
+        The value is negative if a pose is out of reach.
         """
         wrist = base_from_flange[:, :3, 3] - self._flange_m * base_from_flange[:, :3, 2]
         away = np.linalg.norm(wrist - [0.0, 0.0, self._shoulder_m], axis=1)
@@ -201,7 +206,7 @@ class ClosedFormKinematics:
     def branches(self, base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
         """Return all solutions (rad) of the inverse kinematics for a flange pose (4, 4).
 
-        present_rad: present joint angles (6,), which replace undefined angles at a singularity.
+        present_rad: present joint angles (6,). At a singularity, they replace undefined angles.
 
         The solutions are in the order of `BRANCHES`, and may exceed the joint ranges. The list is
         empty if the wrist centre is out of reach.
@@ -238,10 +243,13 @@ class ClosedFormKinematics:
         return found
 
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return the joint angles (6,) rad for a flange pose, nearest to the present angles (6,).
+        """Solve the inverse kinematics with the solution nearest to the present joint angles.
 
-        The nearest solution has the smallest maximum joint change. Raises UnreachableError if no
-        solution is within the joint ranges.
+        base_from_flange: flange pose (4, 4).
+        present_rad: present joint angles (6,).
+
+        Returns joint angles (6,), rad. The nearest solution is the solution with the smallest
+        maximum joint change. Raises UnreachableError if no solution is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         nearest, least = None, inf
@@ -263,10 +271,11 @@ class ClosedFormKinematics:
     def solve_next_joints(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
         """Return the joint angles (6,) rad for the next step of a motion to a flange pose (4, 4).
 
-        Near J5 = 0, a small motion of the flange would require a fast rotation of J4. J4 may lag
-        there, with a pose error of at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD. J1 may lag too
-        if the wrist centre is near the J1 axis. If the solution exceeds the joint ranges, another
-        branch is selected. Raises UnreachableError if no branch is within the joint ranges.
+        Near J5 = 0, a small motion of the flange would require a fast rotation of J4. J4 may
+        therefore lag. The resulting pose error is at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
+        J1 may lag too if the wrist centre is near the J1 axis. If the solution exceeds the joint
+        ranges, another branch is selected. Raises UnreachableError if no branch is within the joint
+        ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -354,6 +363,8 @@ class ClosedFormKinematics:
     def _beyond(self, solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
         """Return the range violation (rad), the index and the angle (rad) of each joint.
 
+        solution: six joint angles, rad.
+
         A range violation is negative if the angle is within the joint range.
         """
         found = []
@@ -368,7 +379,7 @@ class ClosedFormKinematics:
     def find_branch(self, joints_rad: ArrayLike) -> Branch:
         """Return the branch to which joint angles (6,) rad belong.
 
-        At a singularity, where several branches match, the first branch is returned.
+        At a singularity, several branches match, and the first of them is returned.
         """
         joints = np.asarray(joints_rad, dtype=np.float64)
         return Branch(
@@ -380,12 +391,12 @@ class ClosedFormKinematics:
     def solve_joints_on_branch(
         self, base_from_flange: Floats, branch: Branch, near_rad: ArrayLike
     ) -> Floats:
-        """Return joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
+        """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
-        near_rad: joint angles (6,). Of angles that differ by whole revolutions, the nearest to
-            these is returned.
+        near_rad: joint angles (6,). If angles differ by whole revolutions, the angle nearest to
+            `near_rad` is returned.
 
-        Angles may exceed the joint ranges. Angles are NaN for poses out of reach.
+        The angles may exceed the joint ranges. They are NaN if a pose is out of reach.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)
         wrist = poses[:, :3, 3] - self._flange_m * poses[:, :3, 2]
@@ -442,7 +453,9 @@ class ClosedFormKinematics:
     def _out(self, joints: Floats) -> Floats:
         """Return the horizontal distance (m) of the wrist centre from the axis of J1.
 
-        joints: joint angles (..., 6) rad. The distance is negative behind the axis.
+        joints: joint angles (..., 6), rad.
+
+        The distance is negative if the wrist centre is behind the axis.
         """
         q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
         return np.asarray(

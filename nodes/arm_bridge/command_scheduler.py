@@ -1,4 +1,4 @@
-"""Schedule the commands to an arm: when a target arrives, and periodically between targets."""
+"""Schedule the commands to an arm: one for each target, and periodic ones between targets."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class CommandScheduler:
         return max(0.0, 0.5 * self.period_s - since_s) if sent_ns else 0.0
 
     def step_s(self, now_ns: int, sent_ns: int) -> float:
-        """Return the duration (s) of the motion for the next command: 0.5 to 2 periods."""
+        """Return the duration (s) of the motion in the next command: 0.5 to 2 periods."""
         since_s = (now_ns - sent_ns) * 1e-9
         return min(max(since_s, 0.5 * self.period_s), 2.0 * self.period_s)
 

@@ -63,35 +63,37 @@ from flexsheet.nodes.models.motion import (
 from flexsheet.nodes.models.rigid import is_rigid
 
 MAX_REST_RAD_PER_S = 1e-6
-"""The joint speed up to which an arm is considered to be at rest."""
+"""The maximum joint speed at which an arm is considered to be at rest."""
 
 # At this stretch rate the sheet becomes slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
-"""The deviations in position (m), rotation (rad) and stretch ratio below which the slow start ends.
-The sheet then moves within the faster FOLLOW_BOUNDS instead of START_BOUNDS."""
+"""The deviations from the target in position (m), rotation (rad) and stretch ratio below which the
+slow start ends. The sheet then moves within FOLLOW_BOUNDS, which permit higher speeds than
+START_BOUNDS."""
 
 MEASURED_SLACK_M = 0.002
-"""The tolerance of position limits for measured flange positions, because servos ripple."""
+"""The tolerance (m) of the position limits for measured flange positions. Without the tolerance,
+small vibrations of the servos would violate the limits."""
 
 SLACK_STRETCH = 1.0005
-"""The stretch ratio (length / rest length) up to which the sheet is considered slack. At this
+"""The maximum stretch ratio (length / rest length) at which the sheet is considered slack. At this
 ratio, the tension is 0.1 N."""
 
 NO_MOTION = np.zeros(6)
 NO_GOAL = np.full(6, np.nan)
 
 IMPLAUSIBLE_LENGTH_RATIO = 1.1
-"""The ratio of a measured sheet length to the maximum length above which the measurement is
+"""The ratio of the measured to the maximum sheet length above which the measurement is considered
 wrong."""
 
 MAX_JOINT_JUMP_RAD = 0.35
-"""The maximum change of a joint's goal in one cycle. A larger change indicates a switch to another
-solution of the inverse kinematics."""
+"""The maximum change (rad) of a joint's goal angle in one cycle. A larger change indicates that the
+inverse kinematics have switched to another solution."""
 
 RELAX_DELAY_S = 0.5
-"""The time after which the arms slacken the sheet if they have no target or must not move."""
+"""The time (s) after which the arms slacken the sheet if they have no target or are not armed."""
 
 STALE_REASONS = {
     Freshness.STALLED: "the counters of its status stand still, so its joint angles are not used",
@@ -100,21 +102,22 @@ STALE_REASONS = {
 }
 
 MAX_WAIT_FOR_OTHER_S = 1.0
-"""The time after which an armed arm is disarmed if the other arm is not armed."""
+"""The time (s) after which an armed arm is disarmed if the other arm is not armed."""
 
 MAX_ARMING_AGE_S = 1.0
 """The maximum age of an arming command. An older command is refused, because the operator may no
 longer intend it."""
 
 ALIGNED_RAD = 1e-4
-"""The maximum remaining joint motion at the end of an alignment (see `path_check`)."""
+"""The maximum joint motion (rad) that may remain at the end of an alignment (see `path_check`)."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""The tolerance of the joint ranges for measured joint angles. Angles beyond the tolerance are
-treated as measurement errors."""
+"""The tolerance (rad) of the joint ranges for measured joint angles. Angles beyond the tolerance
+are treated as measurement errors."""
 
 RECHECK_PERIOD_S = 0.5
-"""The time after which a blocked path is checked again, because the target may have moved."""
+"""The time (s) after which a blocked path is checked again. The target may have moved in the
+meantime."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +204,7 @@ class ArmControl:
 
     @property
     def ready(self) -> bool:
-        """Return whether the arm may move."""
+        """Return whether the arm is permitted to move."""
         return self._state in READY_STATES
 
     @property
@@ -240,11 +243,12 @@ class ArmControl:
         self._state = target
 
     def on_answer_missed(self, text: str) -> bool:
-        """Record that a command was not answered; return False if the previous one was not either.
+        """Record a missing answer to a command; return whether the motion may continue.
 
         text: reason that is shown to the operator.
 
-        After the first missing answer, the motion continues from the unanswered command.
+        After the first missing answer, the motion continues from the unanswered command. If the
+        next answer is missing too, the result is False.
         """
         if self._missed or self.measured_rad is None:
             return False
@@ -260,7 +264,7 @@ class ArmControl:
         """Record a failed exchange; return True if the connection to the arm has just been lost.
 
         text: reason that is shown to the operator.
-        silent: whether the arm has not answered.
+        silent: True if the arm has not answered.
         """
         if silent and self.last_measured_rad is None:
             # The arm has never answered, so it may still be starting, which is no fault.
@@ -324,7 +328,7 @@ class ArmControl:
     def on_estop(
         self, estop: EStop, stamp_ns: int, now_ns: int, clock_problem: str = ""
     ) -> str | None:
-        """Engage or reset the e-stop; return the reason if a reset is refused, or None if not.
+        """Engage or reset the e-stop; return the reason if a reset is refused, otherwise None.
 
         stamp_ns: timestamp of the message.
         clock_problem: reason why the timestamp is uncertain; empty if the timestamp is certain.
@@ -348,7 +352,7 @@ class ArmControl:
         return None
 
     def reset(self) -> bool:
-        """Clear the e-stop and all faults if the arm is at rest; return whether this succeeded."""
+        """Clear the e-stop and all faults if the arm is at rest; return whether it was at rest."""
         if not self.at_rest:
             return False
         self.estop_reason, self.faults = None, ()
@@ -359,7 +363,7 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm; return the reason if the command is refused, or None if not.
+        """Arm or disarm the arm; return the reason if the command is refused, otherwise None.
 
         age_s: age of the operator's command.
         """
@@ -491,7 +495,7 @@ class ArmControl:
         return self._move_to_target(goal, other, measured)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
-        """Return the reason if the arm must stop without slackening the sheet, or None if not."""
+        """Return why the arm must stop without slackening the sheet, or None if it need not."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if other is not None and other.estopped:
@@ -499,9 +503,9 @@ class ArmControl:
         return clock_problem if clock_problem and not self.faults else None
 
     def _wait_for_arming(self, other: OtherArm) -> Command:
-        """Return the command while an arm is not armed.
+        """Return the command while this arm or the other arm is not armed.
 
-        The command stops the arm, and then slackens the sheet.
+        The command first stops the arm. If this arm is not armed, later commands slacken the sheet.
         """
         self._waited_s += self._step_s
         if self.ready:
@@ -569,7 +573,10 @@ class ArmControl:
         return self._command_sheet(sheet, other)
 
     def _check_measurement(self, other: OtherArm | None, measured: Floats) -> None:
-        """Latch a fault if the measured angles (6,) lag behind the command or violate a limit."""
+        """Latch a fault if the measured joint angles lag behind the command or violate a limit.
+
+        measured: measured joint angles (6,) rad.
+        """
         if self.faults or self._state not in TRACKING:
             return
         violation = check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
@@ -657,7 +664,7 @@ class ArmControl:
 
         speed_factor: factor for the speed bounds; below 1 if this arm is ahead of the other arm.
 
-        After a start, the sheet moves slowly until the sheet has reached the target.
+        After a start, the sheet moves slowly until it has reached the target.
         """
         if not self._settled:
             distance_m, angle_rad = measure_distance(sheet, target)
@@ -706,7 +713,7 @@ class ArmControl:
         return self._decelerate(text)
 
     def _slacken(self, reason: str, other: OtherArm | None) -> Command:
-        """Return the command that stops the arm, and then moves its edge until the sheet is slack.
+        """Return the command that stops the arm, and then moves the arm until the sheet is slack.
 
         reason: text that is shown to the operator.
         """
@@ -766,7 +773,7 @@ class ArmControl:
         return self._move(velocity)
 
     def _decelerate(self, reason: str) -> Command:
-        """Return the command that decelerates the arm along its path, or keeps an arm at rest.
+        """Return the command that decelerates the arm along its path, or keeps the arm at rest.
 
         reason: text that is shown to the operator.
         """
@@ -802,8 +809,8 @@ class ArmControl:
     def _send(self, mode: str, joints_rad: Floats) -> Command:
         """Return the command for joint angles (6,) rad after the final checks.
 
-        A fault is latched if the state permits no motion, or if the step exceeds the maximum joint
-        speeds or tool speed.
+        A fault is latched if the state permits no motion, or if the motion exceeds the maximum
+        joint speeds or tool speed.
         """
         before = self.commanded_rad
         if mode == "move" and self._state not in MOTION_STATES:
@@ -829,7 +836,12 @@ class ArmControl:
         return Command(mode, bounded)
 
     def _is_at_command(self, measured: Floats) -> bool:
-        """Return whether the edge is within MAX_RESTART_SHIFT_M of its commanded position."""
+        """Return whether the measured edge is near its commanded position.
+
+        measured: measured joint angles (6,) rad.
+
+        The maximum distance is MAX_RESTART_SHIFT_M.
+        """
         shift_m = self._geometry.bound_edge_shift_m(self.commanded_rad, measured)
         return shift_m <= MAX_RESTART_SHIFT_M
 
@@ -837,12 +849,12 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured))
 
     def _restart_refusal(self, measured: Floats) -> str | None:
-        """Return the reason why no motion may start at the measured angles (6,) rad, or None.
+        """Return the reason why no motion may start, or None if a motion may start.
 
-        None means that a motion may start.
+        measured: measured joint angles (6,) rad.
 
-        Away from the last commanded position, a motion may start only if the measurements are
-        plausible. If the measured angles were wrong, the arm would jump.
+        If the arm is away from its last commanded position, a motion may start only if the
+        measurements are plausible. If the measured angles were wrong, the arm would jump.
         """
         lowest, highest = self._geometry.range_rad
         beyond = max(float((lowest - measured).max()), float((measured - highest).max()))
@@ -865,7 +877,7 @@ class ArmControl:
     def _restart_at(self, measured: Floats) -> None:
         """Replace the last commanded joint angles by the measured joint angles (6,) rad.
 
-        If the arm does not stand still, a fault is latched instead.
+        If the arm is not at rest, a fault is latched instead.
         """
         if not self._stands_still(measured) or self._restart_refusal(measured) is not None:
             self.faults = self.faults or ("commanded: a start before the arm stands still",)

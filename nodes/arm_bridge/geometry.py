@@ -1,4 +1,4 @@
-"""Describe one arm of the scene: its base, its edge of the sheet, and its limits."""
+"""Describe one arm of the scene: its base, the sheet edge that it holds, and its limits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RANGE_MARGIN_RAD = np.radians(2.0)
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
 """The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
-The margins are necessary because servos ripple and measurements are noisy."""
+The margins are necessary because servos vibrate slightly and measurements are noisy."""
 
 EDGE_SPEED_FRACTION = 0.95
 """The fraction of the maximum tool speed that the sheet's edges may use."""
@@ -49,8 +49,8 @@ def make_kinematics(
 class ArmGeometry:
     """The geometry and the limits of one arm, and of the sheet's edge that the arm holds.
 
-    tool_points_flange: points (4, 3) m in the flange frame: centre and both ends of the clamped
-        edge, and origin of the flange.
+    tool_points_flange: points (4, 3) m in the flange frame: the centre and both ends of the clamped
+        edge, and the origin of the flange.
     """
 
     def __init__(self, scene: Scene, side: Side) -> None:
@@ -110,17 +110,23 @@ class ArmGeometry:
         return self._cached_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
 
     def _solve_flange(self, joints_rad: tuple[float, ...]) -> Floats:
-        """Return the read-only pose base_from_flange (4, 4) at true joint angles (6,) rad."""
+        """Return the flange pose base_from_flange (4, 4), which is read-only.
+
+        joints_rad: joint angles (6,) after correction of the encoder offsets.
+        """
         pose = self.kinematics.forward(np.array(joints_rad))
         pose.flags.writeable = False
         return pose
 
     def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
-        """Return an upper bound (m) of the edge's motion between two joint positions (6,) rad."""
+        """Return an upper bound (m) of the edge's motion between two sets of joint angles.
+
+        joints_rad, other_rad: the two sets of joint angles (6,).
+        """
         return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
-        """Return the world pose (4, 4) of the flange of a rigid arm.
+        """Return the world pose (4, 4) that the flange of a rigid arm would have.
 
         joints_rad: joint angles (6,) that the encoders report.
         """
@@ -131,7 +137,7 @@ class ArmGeometry:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Return `tool_points_flange` (4, 3) m in the base frame at joint angles (6,) rad."""
+        """Transform `tool_points_flange` (4, 3) m to the base frame at joint angles (6,) rad."""
         return apply(self._base_from_flange(joints_rad), self.tool_points_flange)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
@@ -157,7 +163,7 @@ class ArmGeometry:
         return (-1.0 if self.left else 1.0) * (0.5 * length_m + moved_m)
 
     def solve_joints(self, world_from_flange: Floats, near_rad: Floats) -> Floats:
-        """Return the encoder angles (6,) rad that place the flange at a world pose (4, 4).
+        """Return the encoder angles (6,) rad that move the flange to a world pose (4, 4).
 
         near_rad: joint angles (6,) near the result.
 
@@ -171,7 +177,7 @@ class ArmGeometry:
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """Return the pose and stretch of a sheet at rest between the edges of both arms.
 
-        own_edge, other_edge: world poses (4, 4) of the edges if the arms were rigid.
+        own_edge, other_edge: world poses (4, 4) that the edges would have if the arms were rigid.
         """
         limits = self.sheet_limits
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
@@ -199,10 +205,12 @@ class ArmGeometry:
     def check_limits(
         self, flange: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
     ) -> str | None:
-        """Describe the limit that the flanges or the sheet violate; return None if there is none.
+        """Describe the limit that the flanges or the sheet violate, or return None.
 
         flange, other_flange: world poses (4, 4).
         slack_m: tolerance on the limits of the flange.
+
+        The result is None if no limit is violated.
         """
         return check_flange(flange, other_flange, limits, slack_m=slack_m) or check_sheet(
             flange @ self.flange_from_edge,

@@ -33,22 +33,23 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""The lead of one arm over the other arm, as an angle (rad), above which the leading arm slows
-down."""
+"""The lead (rad) above which an arm slows down so that the other arm can catch up. The lead is the
+rotation by which an arm is ahead on the path to the target. `SKEW_LENGTH_M` converts an offset to a
+rotation."""
 
 WAIT_FROM_RAD = 0.12
-"""The lead of one arm over the other arm, as an angle (rad), at which the leading arm waits. At
-0.2 rad, the limiter stops both arms."""
+"""The lead (rad) at which an arm waits for the other arm (see `SLOW_FROM_RAD`). At a lead of 0.2
+rad, the limiter stops both arms."""
 
 MAX_PREDICTION_S = 0.15
-"""The maximum time by which a target's timestamp may be in the future: the prediction horizon and a
-margin."""
+"""The maximum time (s) by which a target's timestamp may be in the future. This time is the sum of
+the prediction horizon and a margin."""
 
 MAX_TRAJECTORY_S = 0.4
-"""The maximum duration of a trajectory, on which an arm moves even if no new message arrives."""
+"""The maximum duration (s) of a trajectory that an arm follows even if no new message arrives."""
 
 SKEW_LENGTH_M = 0.25
-"""The offset between two sheet poses that counts as much as a rotation of 1 rad."""
+"""The offset (m) between two sheet poses that counts as much as a rotation of 1 rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +68,11 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the motion of a target by `ahead_s`, at most by +-`max_extrapolation_s`.
+    """Extrapolate the motion of a target by `ahead_s`.
 
     overdue_s: time since the next target was due. This time is increased if the extrapolation is
         limited, or if the target is too far in the future.
+    max_extrapolation_s: maximum of the absolute extrapolation time.
     """
     carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
     late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)
@@ -123,8 +125,8 @@ def make_goal(
 
     received_ns, now_ns: arrival time of the target, and present time.
     trajectory: result of `find_trajectory` if the other arm follows the trajectory too. The target
-        is then overdue when the trajectory has ended. If None, the target is extrapolated with
-        constant velocity.
+        is then overdue when the trajectory has ended. If the argument is None, the target is
+        extrapolated with constant velocity.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
@@ -145,14 +147,14 @@ def make_goal(
 def compute_sync_factor(
     own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool
 ) -> float:
-    """Return the factor (0..1) for this arm's speed that lets the other arm catch up.
+    """Return the speed factor (0..1) with which this arm lets the other arm catch up.
 
     own_edge, other_edge: world poses (4, 4) of the commanded edges.
     target: target pose world_from_sheet (4, 4).
     left: whether this arm holds the left edge.
 
-    A late control cycle of one bridge would twist the sheet. The arm that is ahead on the path to
-    the target therefore slows down in proportion to its lead.
+    If one bridge had a late control cycle, the sheet would be twisted. The arm that is ahead on the
+    path to the target therefore slows down in proportion to its lead.
     """
     across = other_edge[:3, 3] - own_edge[:3, 3]
     half = (0.5 if left else -0.5) * sqrt(float(across @ across))

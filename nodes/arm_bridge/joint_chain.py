@@ -20,11 +20,12 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
 
 MAX_STEPS = 12
-"""The maximum number of Newton steps from known joint angles. A control cycle needs 2 or 3."""
+"""The maximum number of Newton steps from known joint angles. A control cycle needs 2 or 3 steps.
+"""
 
 WAYPOINTS, STEPS_PER_WAYPOINT = 8, 5
-"""The number of intermediate poses on the way to a distant pose, and the number of Newton steps for
-each intermediate pose."""
+"""The number of intermediate poses between a known and a distant pose, and the number of Newton
+steps for each intermediate pose."""
 
 MAX_STEP_RAD = 0.3
 """The maximum change of a joint in one Newton step."""
@@ -43,17 +44,18 @@ SINGULAR_LENGTH_M = 0.25
 same unit."""
 
 MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
-"""The minimum values of the Jacobian's smallest singular value, for single poses and for paths. At
-the second value, a flange speed of 0.25 m/s requires joint speeds of at most 20 rad/s."""
+"""The minimum values of the Jacobian's smallest singular value. The first value applies to single
+poses, and the second value to paths. At the second value, a flange speed of 0.25 m/s requires joint
+speeds of at most 20 rad/s."""
 
 SEEDS = 256
-"""The number of random joint vectors from which `solve_all` searches for solutions."""
+"""The number of random sets of joint angles from which `solve_all` searches for solutions."""
 
 SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
-"""The minimum of |sin(difference / 2)|, which two distinct solutions exceed in at least one joint.
-"""
+"""The value that |sin(d / 2)| must exceed for at least one joint if two solutions are distinct. The
+angle d is the difference between the solutions for this joint."""
 
 
 class UnreachableError(FlexsheetError, ValueError):
@@ -72,7 +74,10 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class SeedBranch(NamedTuple):
-    """A branch of an arm whose kinematics have no closed form, defined by one joint solution."""
+    """A branch of an arm whose kinematics have no closed form.
+
+    One set of joint angles defines the branch.
+    """
 
     seed_rad: tuple[float, ...]
 
@@ -115,7 +120,7 @@ class SerialChain:
         return self._frames(joints_rad)[-1]
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (..., 6, 6) at joint angles (..., 6) rad.
+        """Return the Jacobian (..., 6, 6) in the base frame at joint angles (..., 6), rad.
 
         The Jacobian maps joint speeds to the linear and then the angular velocity of the flange.
         """
@@ -143,7 +148,7 @@ class SerialChain:
 
 
 class NumericKinematics:
-    """The kinematics of one arm, which are solved numerically by Newton's method."""
+    """The numerical kinematics of one arm, which use Newton's method."""
 
     def __init__(self, model: JointChain) -> None:
         self.model = model
@@ -156,11 +161,11 @@ class NumericKinematics:
         return self._chain.forward(np.asarray(joints_rad, dtype=np.float64))
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (n, 6, 6) in the base frame at joint angles (n, 6) rad."""
+        """Return the Jacobians (n, 6, 6) in the base frame for joint angles (n, 6) rad."""
         return self._chain.jacobian(joints_rad)
 
     def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
-        """Improve joint angles (n, 6) rad for flange poses (n, 4, 4) by Newton steps.
+        """Improve n sets of joint angles (n, 6), rad, for n flange poses (n, 4, 4) by Newton steps.
 
         Returns the joint angles (n, 6) and the remaining errors (n,).
         """
@@ -179,9 +184,11 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Return joint angles (n, 6) rad for flange poses (n, 4, 4), and the pose errors (n,).
+        """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4), and the pose errors (n,).
 
-        The solution proceeds from `joints_rad` (6,) through intermediate poses.
+        joints_rad: joint angles (6,) at which the solution starts.
+
+        The solution proceeds through intermediate poses.
         """
         start = self.forward(joints_rad)
         rotation = scipy.spatial.transform.Rotation
@@ -243,10 +250,10 @@ class NumericKinematics:
         return np.asarray(found)
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return all known joint solutions (6,) rad for a flange pose within the joint ranges.
+        """Return all known solutions (6,), rad, of the inverse kinematics for a flange pose (4, 4).
 
-        The solutions are sorted by their distance from the start angles. The search starts from
-        random joint angles, and may miss a solution.
+        The solutions are within the joint ranges. They are sorted by their distance from the start
+        angles of the arm. The search starts from random joint angles, and may miss a solution.
         """
         random = np.random.default_rng(1)
         low, high = np.maximum(self._lowest, -pi), np.minimum(self._highest, pi)
@@ -269,7 +276,10 @@ class NumericKinematics:
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
-        """Return the branches that reach the first reachable pose in the flange poses (n, 4, 4)."""
+        """Return the branches that reach a flange pose.
+
+        base_from_flange: n flange poses (n, 4, 4); the first pose that the arm can reach is used.
+        """
         for pose in base_from_flange:
             if found := self.solve_all(pose):
                 return [self.find_branch(joints) for joints in found]
@@ -278,9 +288,11 @@ class NumericKinematics:
     def solve_joints_on_branch(
         self, base_from_flange: Floats, branch: SeedBranch, near_rad: Floats
     ) -> Floats:
-        """Return the joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
+        """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
-        Angles are NaN for poses out of reach.
+        near_rad: joint angles (6,) near the solution.
+
+        The angles are NaN if a pose is out of reach.
         """
         joints, errors = self._continue(base_from_flange, np.array(branch.seed_rad))
         return np.where(errors[:, None] <= MAX_ERROR, joints, np.nan)
@@ -290,17 +302,18 @@ class NumericKinematics:
         return float(self._chain.offsets_m.sum() + self._chain.flange_m)
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return the distances (n,), m, of flange poses (n, 4, 4) from the arm's maximum reach.
+        """Return how far (m) n flange poses (n, 4, 4) are within the maximum reach, as (n,).
 
-        The maximum reach is the sum of all link lengths. A distance is positive within reach.
+        The maximum reach is the sum of all link lengths. The value is negative if a pose is out of
+        reach.
         """
         away = np.linalg.norm(base_from_flange[:, :3, 3], axis=1)
         return np.asarray(self._max_distance_m - away)
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) of the Jacobian's smallest singular value at angles (n, 6) rad.
+        """Return the margins (n,) between joint angles (n, 6) rad and the nearest singularities.
 
-        A margin is the smallest singular value minus NEAR_SINGULAR_VALUE.
+        A margin is the smallest singular value of the Jacobian minus NEAR_SINGULAR_VALUE.
         """
         return {"singularity": self._singular_values(joints_rad) - NEAR_SINGULAR_VALUE}
 
@@ -313,9 +326,12 @@ class NumericKinematics:
 
 
 def _pose_errors(wanted: Floats, present: Floats) -> Floats:
-    """Return the translations (m) and rotation vectors (rad) from present to wanted poses, (n, 6).
+    """Return the pose errors (n, 6): translations (m) and rotation vectors (rad).
 
-    The directions of the rotation vectors are exact. Their lengths are exact for small angles only.
+    wanted, present: desired and present poses (n, 4, 4).
+
+    A pose error is the motion from the present pose to the desired pose. The directions of the
+    rotation vectors are exact. Their lengths are exact for small angles only.
     """
     turn = wanted[:, :3, :3] @ np.swapaxes(present[:, :3, :3], 1, 2)
     spin = 0.5 * np.stack(

@@ -2,9 +2,9 @@
 
 Joint speed, joint acceleration and tool speed are clamped. The tool speed is the maximum speed of
 the flange and of the clamped edge of the sheet. Limits of the sheet, of the distance between the
-flanges and of the workspace cannot be clamped. If such a limit is violated, a check returns a text,
-and the caller stops the arm. Joint angles are arrays (6,), in radians. Poses are 4x4 matrices, in
-metres.
+flanges and of the workspace cannot be clamped. If such a limit is violated, a check returns a text
+that describes the violation, and the caller stops the arm. Joint angles are arrays (6,), in
+radians. Poses are 4x4 matrices, in metres.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 TOOL_SPEED_FRACTION = 0.82
 """The fraction of the maximum tool speed that commands may use. The margin is necessary because the
-actual speed of an arm ripples (benchmarks/limiter.py)."""
+actual speed of an arm fluctuates (benchmarks/limiter.py)."""
 
 MAX_TRAVEL_STEP_S = 0.01
-"""The maximum duration of the motion that one command may contain. After a longer gap between
-commands, the arm would exceed the tool speed to catch up."""
+"""The maximum duration (s) of the motion in one command. If the arm had to cover the motion of a
+longer gap between commands, it would exceed the tool speed."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
-"""The minimum and the maximum duration of a command. If the duration were shorter, rounding errors
-would dominate the computed speeds."""
+"""The minimum and the maximum duration (s) of a command. If the duration were shorter, rounding
+errors would dominate the computed speeds."""
 
 LENGTH_TOLERANCE_M = 1e-7
 MIN_BLEND = 0.02
-"""The minimum weight of the desired velocity when it is blended with a decelerating velocity."""
+"""The minimum weight of the desired velocity in a blend with a decelerating velocity."""
 
 ROUNDING_FACTOR = 1.0 + 1e-6
 """The factor by which computed values may exceed a limit because of rounding errors."""
@@ -46,9 +46,9 @@ RANGE_BRAKE_FRACTION = 2.0 / 3.0
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """The limits (6,) of the joints' ranges, speeds and accelerations, and of the tool speed.
+    """The limits of the joints and of the tool speed.
 
-    tool_points: function from joint angles (6,) rad to points (n, 3) m on the tool.
+    tool_points: function from joint angles (6,) rad to n points (n, 3), m, on the tool.
     max_tool_speed: maximum speed of the tool points, m/s.
     """
 
@@ -75,12 +75,12 @@ class SheetLimits:
     workspace_min_m: Floats
     workspace_max_m: Floats
     compliance_m_per_n: float = 0.0
-    """The sum of both flanges' compliances in the direction of the sheet's tension."""
+    """The sum of the compliances of both flanges in the direction of the sheet's tension."""
 
     def sheet_length_m(self, edge_distance_m: float) -> float:
         """Return the length (m) of a sheet whose tension bends the arms.
 
-        edge_distance_m: distance between the edges if the arms were rigid.
+        edge_distance_m: distance that the edges would have if the arms were rigid.
         """
         if self.compliance_m_per_n == 0.0 or not self.width_m < edge_distance_m < math.inf:
             return edge_distance_m
@@ -122,10 +122,11 @@ def limit_velocity(
     goal_rad: joint angles (6,) of the goal at the end of the step. If they are not finite, the arm
         decelerates.
 
-    For any goal, joints_rad + result * step_s is within the joint ranges, and joint and tool speeds
-    are within their limits. If the tool would be too fast, the result is a blend of the desired and
-    of decelerating velocities. The acceleration exceeds its limit only if the joint range or the
-    tool speed requires it. Raises ValueError if `step_s` is not between MIN_STEP_S and MAX_STEP_S.
+    For any goal, joints_rad + result * step_s is within the joint ranges. Joint and tool speeds are
+    within their limits. If the tool would be too fast, the result is a blend of the desired
+    velocity and a decelerating velocity. The acceleration exceeds its limit only if the joint range
+    or the tool speed requires it. Raises ValueError if `step_s` is not between MIN_STEP_S and
+    MAX_STEP_S.
     """
     if not MIN_STEP_S <= step_s <= MAX_STEP_S:
         raise ValueError(
@@ -177,7 +178,7 @@ def find_desired_velocity(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the joint velocities (6,) rad/s that reach the goal without overshoot."""
+    """Return the joint velocities (6,) rad/s that reach a moving goal without overshoot."""
     max_speed = limits.speed_rad_per_s
     goal = _clamp(goal_rad, limits.min_rad, limits.max_rad)
     along = _clamp(goal_velocity, -max_speed, max_speed)
@@ -218,7 +219,10 @@ def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Fl
 
 
 def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
-    """Return the joint velocities (6,) rad/s after one step of deceleration by a common factor."""
+    """Return the joint velocities (6,) rad/s after one step of deceleration.
+
+    All velocities are reduced by the same factor.
+    """
     stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
     return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
 
@@ -265,7 +269,7 @@ def _longest(shifts: Floats) -> float:
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
     """Return the largest blend factor (0 to 1) at which no point moves more than `max_shift_m`.
 
-    slow, fast: displacements (n, 3) m of the points for the factors 0 and 1.
+    slow, fast: displacements (n, 3), m, of n points for the factors 0 and 1.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)
@@ -275,14 +279,14 @@ def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
 
 
 def measure_twist_rad(edge: Floats, other_edge: Floats) -> float:
-    """Return the angle (rad) of the rotation between two edges, given by poses (4, 4)."""
+    """Return the angle (rad) of the rotation between two edges with the poses (4, 4)."""
     # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2).
     apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
     return 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
 
 
 def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
-    """Describe the limit that the sheet violates; return None if there is none.
+    """Describe the limit that the sheet violates; return None if no limit is violated.
 
     edge, other_edge: world poses (4, 4) of this arm's edge and of the other edge.
     left: whether this arm holds the left edge.
@@ -316,12 +320,12 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Describe the violated limit (workspace or flange distance); return None if there is none.
+    """Describe the violated limit of workspace or flange distance, or return None.
 
-    flange_world, other_flange: world poses (4, 4).
+    flange_world, other_flange: world poses (4, 4) of this arm's flange and of the other flange.
     slack_m: tolerance on both limits.
 
-    Values that are not finite violate both limits.
+    The result is None if no limit is violated. Values that are not finite violate both limits.
     """
     position = flange_world[:3, 3]
     lowest, highest = limits.workspace_min_m - slack_m, limits.workspace_max_m + slack_m
@@ -341,7 +345,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Describe a tracking error above the maximum; return None if there is none.
+    """Describe a tracking error above the maximum; return None if no error is above it.
 
     joints_rad, measured_rad: commanded and measured joint angles (6,).
     """

@@ -1,15 +1,15 @@
 """Control an arm by lines of text over TCP, as an example of a driver.
 
 Most controllers can run a program that reads and writes lines on a socket. A command is one line,
-and its answer is one line. Spaces separate the fields:
+and its answer is one line. Spaces separate the fields. A command and its answer have these forms:
 
     SEQUENCE MODE Q1 Q2 Q3 Q4 Q5 Q6
     SEQUENCE COUNT FAULTS Q1 Q2 Q3 Q4 Q5 Q6
 
 SEQUENCE is the number of the command, which its answer repeats. MODE is `idle`, `move`, `hold` or
-`stop`. COUNT is the number of joint measurements of the controller, modulo 2**32. FAULTS is `-`, or
-a list of `ArmFault` names in lower case, separated by commas. Q1 to Q6 are the joint angles in
-radians.
+`stop`. COUNT is the number of joint measurements of the controller, modulo 2**32. FAULTS is `-` if
+there is no fault. Otherwise FAULTS is a list of `ArmFault` names in lower case, separated by
+commas. Q1 to Q6 are the joint angles in radians.
 """
 
 from __future__ import annotations
@@ -83,7 +83,10 @@ class LineLink(ConnectedLink):
                     self.host, self.port, limit=MAX_LINE_BYTES
                 )
         except OSError as error:
-            raise ArmSilentError(f"no connection to {self.host}:{self.port}: {error}") from error
+            raise ArmSilentError(
+                f"no connection to {self.host}:{self.port}: {error}; "
+                "check the controller and the network cable"
+            ) from error
 
     async def _request(
         self, mode: str, joints_rad: Floats, now_ns: int

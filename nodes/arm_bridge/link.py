@@ -15,10 +15,11 @@ from flexsheet.nodes.arrays import Floats
 JOINTS = 6
 
 MAX_UNCHANGED_S = 0.05
-"""The maximum time for which a controller's counters may stay unchanged: seven cycles of 7.1 ms."""
+"""The maximum time (s) for which a controller's counters may stay unchanged: seven cycles of 7.1
+ms."""
 
 MIN_PAUSE_S, MAX_PAUSE_S = 0.05, 0.2
-"""The minimum and the maximum pause before a driver opens a failed connection again."""
+"""The minimum and the maximum pause (s) before a driver opens a failed connection again."""
 
 _COUNTER_PERIOD = 2**32
 
@@ -52,7 +53,7 @@ class ArmRefusedError(ArmLinkError):
 
 
 class ArmAnswerError(ArmLinkError):
-    """An error for an answer that is damaged, of an unknown protocol, or to another command."""
+    """An error for an answer that is damaged, invalid or intended for another command."""
 
     code = "arm-answer"
     remedy = (
@@ -81,18 +82,19 @@ FAULT_TEXTS = {
 
 
 class Freshness(StrEnum):
-    """The freshness of measured joint angles according to the controller's counters."""
+    """The freshness of measured joint angles, determined from the controller's counters."""
 
     FIRST = "first"
     """The first measurement since the start of the link or of the controller."""
     FRESH = "fresh"
     """A new measurement, because the counters have advanced."""
     REPEATED = "repeated"
-    """A repeated measurement: the counters are unchanged, but not for too long a time."""
+    """A repeated measurement. The counters have been unchanged for at most the permitted time."""
     STALLED = "stalled"
-    """A repeated measurement: the counters are unchanged for too long a time."""
+    """A repeated measurement. The counters have been unchanged for more than the permitted time."""
     REVERSED = "reversed"
-    """A measurement from before the previous measurement, because a counter has decreased."""
+    """A measurement that is older than the previous measurement, because a counter has decreased.
+    """
 
     @property
     def is_usable(self) -> bool:
@@ -144,8 +146,8 @@ class CounterMonitor:
 class ArmStatus:
     """An arm's answer: measured joint angles (6,) rad, faults, and the freshness of the angles.
 
-    currents_percent: motor currents (6,) as a percentage of the rated currents; None if not
-        reported.
+    currents_percent: motor currents (6,) as a percentage of the rated currents; None if the arm
+        does not report currents.
     """
 
     joints_rad: Floats
@@ -191,18 +193,18 @@ class ArmLink(Protocol):
 
 
 class ConnectedLink(ABC):
-    """A base class of drivers that send commands over one connection and receive one answer each.
+    """A base class for drivers that send commands over one connection and receive one answer each.
+
+    connections: number of connections that were opened.
 
     A driver implements `connected`, `_connect`, `_request` and `_disconnect`. The base class opens
     the connection, and closes the connection after a failure. The first reconnection is immediate.
     Before each further attempt, the driver waits for a pause. The first pause is MIN_PAUSE_S. Each
     pause is twice as long as the previous one, up to MAX_PAUSE_S.
-
-    connections: number of connections that were opened.
     """
 
     period_s: ClassVar[float] = 0.0071
-    """The period with which the controller measures the joint angles. Answers may repeat a
+    """The period (s) with which the controller measures the joint angles. Answers may repeat a
     measurement for seven periods, or for MAX_UNCHANGED_S if that time is longer."""
 
     def __init__(self, host: str, port: int, *, timeout_s: float) -> None:
@@ -240,7 +242,10 @@ class ConnectedLink(ABC):
         """Close the connection if it is open."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether an exchange may be attempted now; after a failure, a pause follows."""
+        """Return whether an exchange may be attempted now.
+
+        No exchange is attempted during the pause after a failure.
+        """
         return self.connected or now_ns >= self._try_again_ns
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:

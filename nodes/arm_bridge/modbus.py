@@ -3,7 +3,7 @@
 Each control cycle sends one request (function code 23). `COMMAND` and `STATUS` define the register
 map, from which `website.registers_page` generates the tables of docs/modbus.md. Numbers of 32 bits
 occupy two registers, the high register first. The CRC-32 (as in zlib) covers all preceding
-registers of its block, high byte first.
+registers in the same block. The high byte of each register comes first.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
 
     joints_rad: joint angles (6,).
 
-    Sequence number and time are encoded modulo 2^32.
+    The sequence number and the time are encoded modulo 2^32.
     """
     body = struct.pack(
         _COMMAND_FORMAT[:-2],
@@ -167,7 +167,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 class _Framer(FramerSocket):
     """A Modbus framer that fails the pending request if an answer cannot be decoded.
 
-    If the driver used the framer of pymodbus, the request would wait until its time-out.
+    With the framer of pymodbus, the request would wait until its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:
@@ -216,7 +216,10 @@ class ModbusLink(ConnectedLink):
         client.ctx.framer = self._framer
         if not await client.connect():
             client.close()
-            raise ArmSilentError(f"no connection to {self.host}:{self.port}")
+            raise ArmSilentError(
+                f"no connection to {self.host}:{self.port}; "
+                "check the controller and the network cable"
+            )
         self._client = client
 
     async def _request(
@@ -240,7 +243,8 @@ class ModbusLink(ConnectedLink):
                     f"the answer of {self.host}:{self.port} is not Modbus"
                 ) from error
             raise ArmSilentError(
-                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
+                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms; "
+                "check the controller and the network cable"
             ) from error
         if answer.isError():
             code = getattr(answer, "exception_code", "?")

@@ -24,7 +24,7 @@ Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 STEP_RAD = 1e-5
 MAX_SPEED_RAD_PER_S = 0.02
 """The maximum joint speed at which the estimate is valid. At higher speeds, sliding friction and
-acceleration change the currents."""
+acceleration change the motor currents."""
 
 PERIOD_NS = 50_000_000
 
@@ -56,12 +56,14 @@ def estimate_pull_n(
     *,
     forward: Callable[[Floats], Floats],
 ) -> tuple[float, float]:
-    """Return the pull (N) on the edge and its standard deviation (N), by weighted least squares.
+    """Estimate the sheet's pull (N) on the edge, and the standard deviation (N) of the estimate.
 
     joints_rad, currents_percent: joint angles (6,) rad and motor currents (6,), percent.
     edge_flange_m: centre (3,) of the edge in the flange frame.
     towards_base: direction of the pull, a unit vector (3,) in the base frame.
     forward: function from joint angles (6,) rad to the flange pose (4, 4) in the base frame.
+
+    The pull is estimated by weighted least squares.
     """
     at_edge = np.append(edge_flange_m, 1.0)
     edge_m = (forward(joints_rad) @ at_edge)[:3]

@@ -152,10 +152,11 @@ def has_advanced(count: int, before: int, steps: int) -> bool:
 class MxtLink:
     """A driver for a controller that runs an `Mxt` program.
 
-    The controller's counter indicates late answers: it must advance by the number of commands since
-    the last answer. After a lost command, the next answer is therefore dropped too. The mode `idle`
-    restarts the comparison of the counter.
     stale: number of late answers that were dropped.
+
+    Late answers are detected by the controller's counter, which must advance by the number of
+    commands since the last answer. After a lost command, the next answer is therefore dropped too.
+    In the mode `idle`, the next answer is not compared with earlier answers.
     """
 
     def __init__(
@@ -201,7 +202,8 @@ class MxtLink:
                 status = await self._receive(link)
         except TimeoutError as error:
             raise ArmSilentError(
-                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
+                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms; "
+                "check the controller and the network cable"
             ) from error
         except OSError as error:
             raise ArmSilentError(f"{self.host}:{self.port}: {error.strerror}") from error
@@ -217,7 +219,7 @@ class MxtLink:
         return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:
-        """Return the socket, which receives packets from the controller only."""
+        """Open the socket if it is closed. The socket receives packets from the controller only."""
         if self._socket is None:
             link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             link.setblocking(False)
@@ -251,7 +253,7 @@ class MxtLink:
     def close(self) -> None:
         """Command the controller to end external control.
 
-        If the packet is lost, the controller ends external control after a time-out.
+        If this command is lost, the controller ends external control after a time-out.
         """
         if self._socket is not None:
             with contextlib.suppress(OSError):

@@ -27,7 +27,7 @@ MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
 class OtherArm:
     """The state of the other arm: joint angles (6,) rad, world poses (4, 4), mode, faults and age.
 
-    ready: whether the other arm may move.
+    ready: whether the other arm is permitted to move.
     estop_engaged: whether the other arm's bridge has latched an e-stop.
     agrees: whether the other arm follows a trajectory that overlaps with the trajectory of this
         arm. The age of the state is then counted from the end of the other arm's trajectory.
@@ -84,7 +84,7 @@ class OtherArm:
 
     @cached_property
     def invalid_reason(self) -> str | None:
-        """Return the reason why this state must not be used, or None if it is valid."""
+        """Return the reason why this state must not be used, or None if the state is valid."""
         if not np.isfinite(self.joints_rad).all():
             return "its joint angles are not finite"
         if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):

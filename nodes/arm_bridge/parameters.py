@@ -63,7 +63,8 @@ class ArmBridgeParameters(NodeParameters):
     )
     max_tracking_error_rad: Positive = Field(
         default=0.12,
-        description="difference between a measured joint and its command that is a fault, rad",
+        description="difference between measured and commanded joint angle above which a fault is "
+        "latched, rad",
     )
     arming: Literal["manual", "auto"] = Field(
         default="manual",

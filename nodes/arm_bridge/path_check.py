@@ -48,15 +48,16 @@ CORNER_EVERY = 4
 the corners deviate from the simulated motion by less than 1 mm."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""The maximum changes of the target in position (m), rotation (rad) and stretch ratio for which a
-check remains valid."""
+"""The maximum changes of a target in position (m), rotation (rad) and stretch ratio. If the target
+has changed by more since a path check, the check is no longer valid."""
 
 MAX_START_MOTION_RAD = 0.002
-"""The maximum joint motion since a check for which the check remains valid."""
+"""The maximum joint motion (rad) since a path check. If a joint has moved farther, the check is no
+longer valid."""
 
 ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""The positions (fractions of the path) to which the arms may align. The first feasible position is
-used."""
+"""The positions on a path, as fractions of its length, to which the arms may align. The first
+feasible position is used."""
 
 MAX_ALIGN_STEP_RAD = 0.02
 """The maximum change of a joint between two checked points of an alignment."""
@@ -107,7 +108,7 @@ def measure_distance(sheet: SheetMotion, target: SheetMotion) -> tuple[float, fl
 
 
 def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[SheetMotion]:
-    """Simulate the sheet's motion to a goal at rest, and return the points of its path."""
+    """Simulate the sheet's motion to a goal at rest, and return points of the simulated path."""
     resting = replace(goal, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
     sheet, corners = start, [start]
     for step in range(1, round(MAX_REHEARSAL_S / REHEARSAL_STEP_S)):
@@ -127,12 +128,12 @@ def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[Sh
 class Alignment:
     """A straight joint motion that moves one arm to a point on the path of the sheet.
 
-    An alignment is necessary if the arms have stopped with a twisted sheet, or at the end of a
-    joint's range.
-
     sheet: first pose on the path that both arms can reach.
     from_rad, to_rad: this arm's joint angles (6,) at the start and at the end.
     duration_s: duration, which is equal for both arms; 0 if no motion is necessary.
+
+    An alignment is necessary if the arms have stopped with a twisted sheet, or with a joint at the
+    end of its range.
     """
 
     sheet: SheetMotion
@@ -148,7 +149,7 @@ class Alignment:
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return the alignment of this arm to the path, or the reason why the path is blocked."""
+    """Return the motion that aligns this arm to the path, or the reason why the path is blocked."""
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
         return (
@@ -190,7 +191,7 @@ def _check_alignment(
 
     begin, there: joint angles of both arms at the start and at the end.
 
-    Limits that are already violated at the start are widened.
+    A limit that is already violated at the start is widened.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)
@@ -240,9 +241,9 @@ class PathChecker:
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
         """Return a finished request and its result, or None if no check has finished.
 
-        The caller must call this method in every cycle.
-
         request: path whose check is started if no check is running; None if no check is necessary.
+
+        The caller must call this method in every cycle.
         """
         if self._running is None:
             if request is not None:

@@ -2,8 +2,8 @@
 
 Two arms hold the sheet by its left and right edges. An array of n poses of the sheet consists of
 world poses (n, 4, 4) and stretch ratios (n,). Joint angles are (n, 6) rad. A margin is the distance
-to a limit, positive within the limit. Margins of speeds are fractions of the limit. A branch is one
-of the discrete solutions of the inverse kinematics.
+to a limit. It is positive if the limit is met. Margins of speeds are fractions of the maximum
+speed. A branch is one of the discrete solutions of the inverse kinematics.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ MAX_STEP_RAD = 0.05
 """The maximum change of a joint between two samples of a path."""
 
 MIN_FRACTION = 1e-6
-"""The minimum distance between two samples, as a fraction of the path. A joint motion of more than
-MAX_STEP_RAD over this distance is discontinuous."""
+"""The minimum distance between two samples, as a fraction of the path. If a joint moves by more
+than MAX_STEP_RAD over this distance, the joint's motion is discontinuous."""
 
 ROUNDING = 1e-9
 """The tolerance of margins for rounding errors."""
@@ -68,10 +68,10 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class SheetPoses:
-    """World poses (n, 4, 4) of the sheet, with a stretch ratio (n,) and k twists (n, k, 6) each.
+    """World poses (n, 4, 4) of the sheet at n samples, with their stretch ratios (n,).
 
-    twists_world: velocities (m/s, rad/s) of the sheet's centre that the arms must be able to follow
-        at each pose; k may be 0.
+    twists_world: k velocities (m/s, rad/s) of the sheet's centre at each sample, as an array (n, k,
+        6). The arms must be able to follow them. The number k may be 0.
     """
 
     world_from_sheet: Floats
@@ -82,13 +82,13 @@ class SheetPoses:
         return len(self.stretch_ratio)
 
     def some(self, chosen: NDArray[np.intp] | Bools) -> SheetPoses:
-        """Return the poses that an array of indices or of booleans selects."""
+        """Return the poses that an array of indices or booleans selects."""
         return SheetPoses(
             self.world_from_sheet[chosen], self.stretch_ratio[chosen], self.twists_world[chosen]
         )
 
     def without_twists(self) -> SheetPoses:
-        """Return the same poses without twists."""
+        """Return the same poses without velocities."""
         return SheetPoses(self.world_from_sheet, self.stretch_ratio, np.empty((len(self), 0, 6)))
 
 
@@ -98,7 +98,8 @@ class ArmReach:
 
     joints_rad: joint angles (n, 6); NaN for poses that are out of reach.
     margins: margins (n,) for each limit in `LIMITS`. Margins that depend on joint angles are NaN
-        for poses out of reach. Margins are infinite for singularities that the arm does not have.
+        for poses that are out of reach. Margins are infinite for singularities that the arm does
+        not have.
     """
 
     branch: Any
@@ -107,7 +108,7 @@ class ArmReach:
 
     @property
     def binding(self) -> NDArray[np.intp]:
-        """Return the first violated limit of each pose as an index (n,) in `LIMITS`.
+        """Return the first violated limit of each pose, as indices (n,) into `LIMITS`.
 
         The index is -1 for a pose that violates no limit.
         """
@@ -215,7 +216,11 @@ def _margins(
 def _speeds(
     geometry: ArmGeometry, joints: Floats, flanges: Floats, places: SheetPoses
 ) -> tuple[Floats, Floats]:
-    """Return the maximum joint speeds (n, 6) rad/s and tool speeds (n,) m/s over all twists."""
+    """Return the maximum joint speeds (n, 6), rad/s, and tool speeds (n,), m/s, over all twists.
+
+    joints: joint angles (n, 6), rad.
+    flanges: world poses (n, 4, 4) of the flange for n poses of the sheet.
+    """
     fastest, tool = np.zeros_like(joints), np.zeros(len(joints))
     centre = places.world_from_sheet[:, :3, 3]
     points = _tool_points(geometry, flanges)
@@ -238,7 +243,7 @@ def _speeds(
 
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
-    """Return the points `ArmGeometry.tool_points_flange` (n, 4, 3) m in the world frame."""
+    """Return the tool points (n, 4, 3), m, in the world frame for n flange poses (n, 4, 4)."""
     points = np.einsum("nij,pj->npi", flanges[:, :3, :3], geometry.tool_points_flange)
     return np.asarray(points + flanges[:, None, :3, 3])
 

@@ -12,8 +12,8 @@ from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.models.servo_lag import ServoLagEstimator
 
 REPORTED_TARGETS = 12
-"""The number of targets over which the reported latency is averaged. At 60 Hz, there are five
-reports per second."""
+"""The number of targets over which the reported latency is averaged. At 60 targets per second,
+there are five reports per second."""
 
 
 @dataclass(slots=True)

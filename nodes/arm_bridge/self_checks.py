@@ -9,8 +9,8 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.servo_lag import LagEstimate
 
 LAG_THRESHOLD_S = 0.01
-"""The maximum deviation of the measured servo lag from the configured lag: five standard deviations
-of a calibrated lag (2 ms)."""
+"""The maximum deviation (s) of the measured servo lag from the configured lag. It equals five
+standard deviations (2 ms each) of a calibrated lag."""
 
 TRACKING_THRESHOLD_RAD = 0.005
 """The maximum difference between the measured tracking error and the tracking error of an ideal

@@ -8,30 +8,32 @@ from flexsheet.nodes.arm_bridge.link import Freshness
 from flexsheet.nodes.arrays import Floats
 
 STANDSTILL_COUNT = 5
-"""The number of consecutive unchanged measurements after which an arm is at rest if it has reached
-its last command."""
+"""The number of consecutive unchanged measurements after which an arm counts as being at rest if it
+has reached its last command."""
 
 SETTLED_COUNT = 100
-"""The number of consecutive unchanged measurements after which an arm is at rest if it has not
-reached its last command. The number is sufficient for measurements that lag by 0.7 s."""
+"""The number of consecutive unchanged measurements after which an arm counts as being at rest if it
+has not reached its last command. The number is sufficient for measurements that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
-"""The maximum difference between measurements that count as unchanged: 200 times the encoder
-noise."""
+"""The maximum difference (rad) between measurements that count as unchanged. It is 200 times the
+encoder noise."""
 
 MAX_RESTART_SHIFT_M = 0.005
-"""The maximum distance between commanded and measured edge at which a motion may restart. Servos
-with a lag of at least 15 ms cover this distance at less than 0.25 m/s."""
+"""The maximum distance (m) between the commanded and the measured edge at which a motion may
+restart. If the servo lag is at least 15 ms, an edge lags by this distance at a speed below 0.25
+m/s."""
 
 JUMP_MARGIN_RAD = 0.002
-"""The tolerance of the plausible joint motion between two measurements."""
+"""The tolerance (rad) of the plausible joint motion between two measurements."""
 
 JUMP_SPEED_RAD_PER_S = 0.5
 """The maximum plausible joint speed of an arm that is not commanded to move. The operator may move
 the arm with the teach pendant."""
 
 OVERSPEED = 1.5
-"""The maximum ratio of an arm's speed to its commanded speed while the arm catches up."""
+"""The maximum ratio of an arm's speed to its commanded speed while the arm catches up with its
+commands."""
 
 MEMORY_S = 0.1
 """The time constant with which the influence of earlier commanded speeds and joint angles

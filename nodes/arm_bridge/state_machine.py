@@ -11,7 +11,8 @@ from flexsheet.messages.types import ArmMode
 class State(Enum):
     """The states of an arm's controller, with their descriptions for the documentation.
 
-    In states whose names end in `TAUT`, the sheet may be stretched, and the arm may slacken it.
+    In states whose names end in `TAUT`, the sheet may be stretched. The arm is permitted to slacken
+    it.
     """
 
     STARTING = "the arm has not answered since its bridge started"
@@ -72,7 +73,7 @@ RELAXING = frozenset({S.RELAX})
 
 CHECKING_STATES = frozenset({S.CHECKING, S.CHECKING_TAUT})
 READY_STATES = ARMED_AT_REST | TRACKING | PAUSING_STATES
-"""The states in which the arm is armed and may move."""
+"""The states in which the arm is armed and permitted to move."""
 MOTION_STATES = TRACKING | DECELERATING | RELAXING
 """The states in which commands may change the joint angles."""
 
@@ -95,8 +96,8 @@ MODES: Mapping[State, ArmMode] = {
     S.STOPPING_TAUT: "stopping",
     S.RELAX: "relax",
 }
-"""The published mode of each state. Exception: in the state TAUT, the mode is `fault` if a fault is
-latched."""
+"""The published mode of each state. There is one exception: in the state TAUT, the mode is `fault`
+if a fault is latched."""
 
 Row = dict[tuple[State, Event], State | None]
 

@@ -53,9 +53,9 @@ def _monotonic_ms(real_time_ns: int) -> float:
 
 
 class CapturedDevice(ABC):
-    """A base class of captures that start their device on its first use.
+    """A base class for captures that start their device on its first use.
 
-    stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if unknown.
+    stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if the timestamp is unknown.
     wanted: requested value of each OpenCV property of the image format.
     actual: values of OpenCV properties that are constant after the start.
     """
@@ -118,7 +118,7 @@ class CapturedDevice(ABC):
 class AravisCapture(CapturedDevice):
     """A capture of a GenICam camera (GigE Vision or USB3 Vision) with the library Aravis.
 
-    device: name of the camera, or empty for the only camera.
+    device: name of the camera; empty if there is only one camera.
     """
 
     def __init__(self, device: str) -> None:
@@ -215,7 +215,7 @@ class AravisCapture(CapturedDevice):
 class RealSenseCapture(CapturedDevice):
     """A capture of the infrared pair of a RealSense camera, as one image with both views.
 
-    device: serial number, or empty for any camera.
+    device: serial number; empty if any camera may be used.
 
     The dot projector of the camera is switched off. Both sensors are triggered together. The
     timestamp is the middle of the exposure if the camera reports sensor timestamps.
@@ -299,7 +299,10 @@ class RealSenseCapture(CapturedDevice):
         return True
 
     def _find_stamp_ms(self, frame: Any) -> float:
-        """Return the middle of the exposure as a time (ms) of the monotonic clock; 0 if unknown."""
+        """Return the middle of the exposure as a time (ms) of the monotonic clock, or 0.
+
+        The result is 0 if this time is unknown.
+        """
         rs = self._rs
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0.0

@@ -48,12 +48,13 @@ def open_reader(
 class ReaderThread(threading.Thread):
     """A thread that reads image pairs from a source, and reopens the source after a failure.
 
-    deliver(images, lost): called for each image pair, with the total number of lost frames.
-    fail(error): called for each DeviceError. The source is then opened again after a delay, which
-        doubles from `retry_s` to MAX_RETRY_S until images arrive.
-    report(text): called for every device after it is opened, with its format and settings.
-    warn(text): called for every setting that a device does not accept.
-    finish(pairs): called at the end of the source, with the number of image pairs.
+    deliver(images, lost): function that receives each image pair and the total number of lost
+        frames.
+    fail(error): function that receives each DeviceError. The source is then opened again after a
+        delay, which doubles from `retry_s` to MAX_RETRY_S until images arrive.
+    report(text): function that receives the format and the settings of each opened device.
+    warn(text): function that receives a text about each setting that a device does not accept.
+    finish(pairs): function that receives the number of image pairs at the end of the source.
     regions: sensor regions to deliver; None means the full images.
 
     All functions are called in the thread itself.

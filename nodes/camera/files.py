@@ -35,7 +35,7 @@ class FileFrame:
 class VideoFile:
     """A video file that is read frame by frame.
 
-    rate_hz: frame rate. If None, the frame times in the file are used.
+    rate_hz: frame rate; None means that the frame times in the file are used.
 
     Raises DeviceError if the file cannot be opened.
     """
@@ -66,7 +66,7 @@ class VideoFile:
             if time_ns <= self._newest_ns:
                 raise DeviceError(
                     f"{self.path}: the time of frame {self._number}, {time_ms:g} ms, is not after "
-                    "that of the previous frame; set rate_hz of the camera node's source"
+                    "the time of the previous frame; set rate_hz of the camera node's source"
                 )
         self._number += 1
         self._newest_ns = time_ns
@@ -78,7 +78,7 @@ class VideoFile:
 
 
 class FileReader:
-    """A base class of readers of image files. The method `read` never waits."""
+    """A base class for readers of image files. The method `read` never waits."""
 
     paced = True
     rate_hz: float | None = None
@@ -93,7 +93,7 @@ class FileReader:
 
 
 class VideoReader(FileReader):
-    """A reader of one video file with both views, or of two video files with paired frames."""
+    """A reader of one video file with both views, or of two video files whose frames are paired."""
 
     def __init__(self, source: VideoSource, camera_rate_hz: float) -> None:
         self._source, self._camera_rate_hz = source, camera_rate_hz
@@ -116,7 +116,10 @@ class VideoReader(FileReader):
         self._pairing = Pairing(1.0 / rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair, or None at the end. Raises DeviceError for a faulty file."""
+        """Return the next image pair, or None if the end of the video has been reached.
+
+        Raises DeviceError if a file is faulty.
+        """
         frames = self._next()
         if frames is None and self._source.loop:
             self.close()
@@ -125,7 +128,10 @@ class VideoReader(FileReader):
             self._clock.restart()
             frames = self._next()
             if frames is None:
-                raise DeviceError(f"{self._source.left}: the video contains no image pair")
+                raise DeviceError(
+                    f"{self._source.left}: the video contains no image pair; correct the camera "
+                    "node's source"
+                )
         if frames is None:
             return None
         notes = ["frame times of the file" if self._source.rate_hz is None else "at the set rate"]
@@ -147,7 +153,7 @@ class VideoReader(FileReader):
     def _next(self) -> tuple[FileFrame, ...] | None:
         """Return the two frames of the next image pair, or one frame that contains both views.
 
-        Return None at the end of a file.
+        Returns None if the end of a file has been reached.
         """
         if len(self._files) == 1:
             (file,) = self._files
@@ -170,9 +176,11 @@ class VideoReader(FileReader):
 class _LoopClock:
     """A clock whose time continues to increase when a file is read again from its start.
 
-    The interval between two passes equals the interval between the last two images of the file.
+    rate_hz: frame rate, which determines the interval between two passes if the file has a single
+        image.
 
-    rate_hz: frame rate, which determines the interval if the file has a single image.
+    Otherwise, the interval between two passes equals the interval between the last two images of
+    the file.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -269,8 +277,9 @@ class ImagesReader(FileReader):
         self._clock = _LoopClock(rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next pair of images, or None at the end. Raises DeviceError for a faulty
-        file.
+        """Return the next image pair, or None after the last pair.
+
+        Raises DeviceError if a file is faulty.
         """
         if self._next == len(self._pairs):
             if not self._loop:

@@ -33,9 +33,10 @@ def load_detector(search_width_px: int) -> Detector:
     """Load the face detector and the landmark model of the package dlib.
 
     search_width_px: width to which larger images are reduced for the face search. The eyes are then
-        detected in the full image. If an image contains several faces, the largest face is used.
+        detected in the full image.
 
-    Raises DeviceError if dlib or its models are not installed.
+    If an image contains several faces, the largest face is used. Raises DeviceError if dlib or its
+    models are not installed.
     """
     # The module with the models is only located, because its import needs setuptools.
     models = find_spec("face_recognition_models")
@@ -69,13 +70,12 @@ def locate_eyes(
 ) -> tuple[Floats, Floats]:
     """Return the midpoint (3,) of the eyes and the vector (3,) from the left to the right eye.
 
-    Both results are in the world frame, m.
-
     pixels: positions (2, 2) of the left and the right eye in the image, px.
     interocular_m: distance between the eyes.
 
-    Both eyes are assumed to have the same depth. If the head is rotated about the vertical by an
-    angle, the computed distance is too large by about 1 / cos(angle).
+    Both results are in the world frame, m. Both eyes are assumed to have the same depth. If the
+    head is rotated about the vertical by an angle, the computed distance is too large by a factor
+    of about 1 / cos(angle).
     """
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
     rays = np.ones((2, 3))
@@ -103,7 +103,7 @@ class EyeFilter:
         self._last: tuple[float, Floats, Floats] | None = None
 
     def update(self, at_s: float, value: Floats) -> Floats:
-        """Add a value (n,), and return the filtered value (n,).
+        """Add a value with n elements (n,), and return the filtered value (n,).
 
         at_s: time of the value, which must be later than the time of the previous value.
         """

@@ -29,8 +29,8 @@ from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 JOIN_S = 1.0
 DRAIN_NS = 10_000_000
-"""The time after a face search in which arriving images are discarded. These images have waited in
-the driver's queue and are outdated."""
+"""The time (ns) after a face search in which arriving images are discarded. These images have
+waited in the driver's queue and are outdated."""
 PixelCount = Annotated[int, Field(gt=0)]
 
 
@@ -192,9 +192,10 @@ class HeadCamera(Node):
 class FaceReader(threading.Thread):
     """A thread that searches the newest image of a camera for eyes.
 
-    deliver(at_ns, pixels): called for each searched image, with the time of its exposure and the
+    deliver(at_ns, pixels): function that receives the exposure time of each searched image, and the
         pixel positions (2, 2) of the eyes. The positions are None if the image shows no face.
-    fail(error): called for each DeviceError. The camera is then opened again after a delay.
+    fail(error): function that receives each DeviceError. The camera is then opened again after a
+        delay.
 
     Both functions are called in the thread itself.
     """

@@ -20,7 +20,7 @@ Now = Callable[[], int]
 
 
 class DeviceError(FlexsheetError, RuntimeError):
-    """Raised if a device or file cannot be read, or delivers images of an unexpected size."""
+    """An error for a device or file that cannot be read, or that delivers wrong image sizes."""
 
     code = "device"
     remedy = (
@@ -30,7 +30,10 @@ class DeviceError(FlexsheetError, RuntimeError):
 
 
 class Region(NamedTuple):
-    """A part of a sensor: column and row of its first pixel (from zero), width and height (px)."""
+    """A rectangle of sensor pixels: column and row of the first pixel, width and height (px).
+
+    Columns and rows are counted from zero.
+    """
 
     column: Annotated[int, Field(ge=0)]
     row: Annotated[int, Field(ge=0)]
@@ -57,11 +60,11 @@ Regions = tuple[Region, Region]
 class ImagePair:
     """A left and a right grey image (height, width) with nearly equal exposure times.
 
-    exposure_ns: mean of both mid-exposure times on the reader's clock. If the source is a file, the
-        clock starts at the start of the file.
-    exposure_s: duration of the exposure that the device reports; None if unknown.
+    exposure_ns: mean of both mid-exposure times on the reader's clock. If the source is a file,
+        this clock starts at the start of the file.
+    exposure_s: duration of the exposure that the device reports; None if it is unknown.
     skew_s: mid-exposure time of the right image minus mid-exposure time of the left image.
-    regions: sensor regions of the images; None means full sensors.
+    regions: sensor regions of the images; None means the full sensors.
     notes: remarks for the operator.
     """
 
@@ -77,9 +80,10 @@ class ImagePair:
 class Reader(Protocol):
     """The interface of readers of image pairs.
 
-    paced: whether `read` returns immediately, as for files. In that case, the caller must wait
-        until each image pair is due.
-    rate_hz: frame rate of a device, to count lost frames; None if the source is a file.
+    paced: whether `read` returns immediately because the images come from files. In that case, the
+        caller must wait until each image pair is due.
+    rate_hz: frame rate of a device, which is necessary to count lost frames; None if the source is
+        a file.
     warnings: texts about settings that the device did not accept.
     opened: texts about the actual format and settings of each device; empty if the source is a
         file.
@@ -91,7 +95,10 @@ class Reader(Protocol):
     opened: tuple[str, ...]
 
     def read(self) -> ImagePair | None:
-        """Wait for the next image pair; return None at the end. Raises DeviceError on failure."""
+        """Wait for the next image pair; return None after the last pair.
+
+        Raises DeviceError if the source fails.
+        """
         ...
 
     def interrupt(self) -> None:
@@ -110,7 +117,7 @@ def make_stereo_message(
     """Make the message for an image pair.
 
     device: name of the camera.
-    exposure_s: exposure time that is used if the device reports none.
+    exposure_s: exposure time that is used if the device reports no exposure time.
     """
     origins = [(region.column, region.row) for region in images.regions or ()] or [(0, 0)] * 2
     return StereoPair(
@@ -146,7 +153,7 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 
 
 def describe_skew(skew_s: float, limit_s: float) -> str:
-    """Return the reason for the rejection of an image pair, as text.
+    """Return a text that states why an image pair is rejected.
 
     skew_s: time between the left and the right exposure.
     limit_s: maximum permitted time.
@@ -158,7 +165,7 @@ def describe_skew(skew_s: float, limit_s: float) -> str:
 
 
 def convert_to_gray(image: NDArray[Any]) -> Image:
-    """Convert an image to a grey image (h, w).
+    """Convert an image of height h and width w to a grey image (h, w).
 
     image: grey (h, w) or (h, w, 1), BGR (h, w, 3), or brightness and a second channel (h, w, 2).
     """
@@ -168,11 +175,12 @@ def convert_to_gray(image: NDArray[Any]) -> Image:
 
 
 def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
-    """Split an image (h, 2w) with both views side by side into the left and right view (h, w).
+    """Split an image with both views side by side into the left and the right view.
 
+    image: image (h, 2w) of two views (h, w) with the height h and the width w.
     name: name of the source in the error text.
 
-    Raises DeviceError if the width is odd.
+    Raises DeviceError if the width of the image is odd.
     """
     if image.shape[1] % 2:
         raise DeviceError(

@@ -35,7 +35,7 @@ MAX_WAITING_FRAMES = 4
 """The maximum number of frames in the queue for pairing. If the queue is full, a new frame replaces
 the oldest frame."""
 FIRST_FRAME_S = 5.0
-"""The minimum timeout (s) for the first frame, because sensors need time to start."""
+"""The minimum timeout (s) for the first frame. Sensors need time to start."""
 RELEASE_S = 0.5
 
 RATE_FRAMES = 61
@@ -260,7 +260,7 @@ class CameraReader:
     def _pop_frames(self) -> tuple[CapturedFrame, ...] | None:
         """Remove the next image pair from the queues, and return its one or two frames.
 
-        The result has one frame if the frame contains both views. Return None if no pair is
+        The result has one frame if the frame contains both views. Returns None if no pair is
         complete.
         """
         if len(self._streams) == 1:
@@ -294,7 +294,7 @@ class CameraReader:
     def _describe_silence(self, counts: list[int]) -> str:
         """Return an error text with the reason why no image pair arrived.
 
-        counts: number of frames of each camera at the start of the wait.
+        counts: number of frames that each camera had delivered when the wait began.
         """
         silent = [
             repr(stream.device)
@@ -321,7 +321,10 @@ class CameraReader:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Close the cameras. A camera that is waiting for a frame is released after the frame."""
+        """Close the cameras.
+
+        If a camera is waiting for a frame, the camera is released after this frame has arrived.
+        """
         for stream in self._streams:
             stream.stop()
         for stream in self._streams:

@@ -153,8 +153,8 @@ class Camera(Node):
     def _publish(self, images: ImagePair, device: str, exposure_s: float, lost: int) -> None:
         """Publish an image pair, unless its two exposures are too far apart in time.
 
-        exposure_s: exposure time that is used if the device reports none.
-        lost: total number of lost frames; rejected pairs do not count.
+        exposure_s: exposure time that is used if the device reports no exposure time.
+        lost: total number of lost frames, without the frames of rejected pairs.
         """
         limit_s = self.parameters.max_skew_s
         if limit_s is not None and abs(images.skew_s) > limit_s:

@@ -17,12 +17,13 @@ points, the change of the lens distortion is negligible."""
 MARGIN_PX = 16.0
 """The margin around a region, which allows for blur of the marker and for calibration errors."""
 ALIGN_PX = (16, 2)
-"""The column and row numbers at which a region starts must be multiples of these numbers."""
+"""The alignment of a region. The numbers of its first column and row must be multiples of these two
+numbers."""
 NEAREST_M = 1e-3
 
 
 class ExplicitRegions(LimitedModel):
-    """The sensor regions in a launch file: [column, row, width, height] (px) of each view."""
+    """The sensor region of each view in a launch file, as [column, row, width, height] in px."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -31,7 +32,7 @@ class ExplicitRegions(LimitedModel):
 
 
 def volume_points(low_m: Floats, high_m: Floats) -> Floats:
-    """Return a grid of points (n, 3) that fills the box between two opposite corners (3,)."""
+    """Return a grid of n points (n, 3) that fills the box between two opposite corners (3,)."""
     axes = [np.linspace(low, high, GRID) for low, high in zip(low_m, high_m, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
@@ -39,9 +40,11 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
 def find_visible_region(
     points_camera: Floats, lens: Lens, width_px: int, height_px: int
 ) -> Region | None:
-    """Return the sensor region that shows all visible points (n, 3) m in the camera frame.
+    """Return the sensor region that shows all visible points among n points (n, 3), m.
 
-    Return None if no point is visible, and the full sensor if some points are behind the camera.
+    points_camera: points in the camera frame.
+
+    Returns None if no point is visible, and the full sensor if some points are behind the camera.
     The distortion polynomial is invalid beyond the image's corners. Points beyond the corners are
     therefore moved to the circle through the farthest corner.
     """
@@ -95,7 +98,7 @@ def find_finger_regions(scene: Scene) -> Regions:
 
 
 def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | None:
-    """Return the sensor regions to publish, or None for both full sensors.
+    """Return the sensor regions to publish, or None if both full sensors are published.
 
     setting: "full", "finger" (the regions in which the finger can appear), or explicit regions.
 

@@ -35,7 +35,8 @@ class Backend:
     exposure_unit_s, whole_units: unit of CAP_PROP_EXPOSURE, and whether its values are integers.
     auto_exposure: OpenCV property, and the value that selects manual exposure.
     autos: names and properties of further automatic functions, which the value 0 switches off.
-    offsets: properties for the first column and row of the sensor region; None if not supported.
+    offsets: properties for the first column and row of the sensor region; None if the backend does
+        not support regions.
     buffers: number of frame buffers to request from the driver.
     stamp_fraction: time from the middle of the exposure to the driver's timestamp, as a fraction of
         the exposure time.
@@ -86,8 +87,8 @@ BACKENDS = {
 class DeviceSettings:
     """The actual settings of a device.
 
-    exposure_s: exposure time; None if unknown.
-    got: text with the format and the settings, for the log and the status of the node.
+    exposure_s: exposure time; None if it is unknown.
+    got: text about the format and the settings, for the log and the status of the node.
     warnings: texts about settings that the device did not accept.
     """
 
@@ -213,8 +214,8 @@ def set_region(
 ) -> Region | None:
     """Set the region of the sensor that the device reads.
 
-    Returns the actual region, or None for the full sensor. If the actual region does not contain
-    the requested region, the full sensor is used.
+    Returns the actual region, or None if the device reads the full sensor. If the actual region
+    does not contain the requested region, the full sensor is used.
     """
     if backend is None or backend.offsets is None:
         return None

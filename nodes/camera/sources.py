@@ -41,7 +41,7 @@ class OpenCvSource(CameraSource):
     api: Literal["v4l2", "ximea", "aravis", "realsense", "gstreamer", "any"] | None = Field(
         default=None,
         description="library that opens the camera; null: v4l2 for numbers and for paths under "
-        "/dev, else any",
+        "/dev, otherwise any",
     )
     pixel_format: Annotated[str, Field(min_length=4, max_length=4)] | None = Field(
         default=None,

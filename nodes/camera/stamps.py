@@ -9,11 +9,10 @@ from typing import TypeVar
 T = TypeVar("T")
 
 MAX_FUTURE_NS = 1_000_000
-"""The maximum time by which a timestamp may be later than the frame's arrival, because of
-rounding."""
+"""The maximum time (ns) by which rounding may make a timestamp later than the frame's arrival."""
 MAX_AGE_NS = 1_000_000_000
-"""The maximum age (ns) of a timestamp when the frame arrives. Drivers with several frame buffers
-need this time at 10 Hz."""
+"""The maximum age (ns) of a timestamp when the frame arrives. At 10 frames per second, drivers with
+several frame buffers need this time."""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
 """The tolerance for the pairing of frames, as a fraction of the frame period. If there were no
@@ -52,11 +51,11 @@ class StampCheck:
 class Pairing:
     """A matcher that pairs the frames of two cameras by their exposure times.
 
+    unpaired: number of dropped frames.
+
     The cameras have equal frame rates, but no common trigger. Two frames are a pair if the time
     between their exposures is at most half a period, plus a tolerance. Otherwise the older frame is
     dropped.
-
-    unpaired: number of dropped frames.
     """
 
     def __init__(self, period_s: float) -> None:

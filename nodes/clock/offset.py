@@ -1,13 +1,14 @@
 """Estimate the offset of another clock from pings, with guaranteed bounds.
 
-A ping has four timestamps. The ping is sent at t1 on the own clock and received at t2 on the other
-clock. The reply is sent at t3 on the other clock and received at t4 on the own clock. A message
-always arrives after it was sent. The other clock minus the own clock is therefore at most t2 - t1
-at time t1, and at least t3 - t4 at time t4. Between both times, the offset changes at most by the
-maximum drift. No assumption about the network's delays is necessary.
+A ping has four timestamps. The ping is sent at t1 on the local clock and received at t2 on the
+other clock. The reply is sent at t3 on the other clock and received at t4 on the local clock. A
+message always arrives after it was sent. The offset is the time of the other clock minus the time
+of the local clock. It is therefore at most t2 - t1 at time t1, and at least t3 - t4 at time t4.
+Between both times, the offset changes at most by the maximum drift. No assumption about the
+network's delays is necessary.
 
-Source: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on the intersection of
-    intervals.
+Sources: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on the intersection of
+intervals.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ FIT_SPAN_NS = 5_000_000_000
 class Sample:
     """A measurement of the clock offset by one ping, with its bounds.
 
-    The other clock minus the own clock was offset_ns +- half_ns at time `at_ns` of the own clock.
+    At the time `at_ns` of the local clock, the time of the other clock minus the time of the local
+    clock was offset_ns +- half_ns.
     """
 
     at_ns: int
@@ -35,11 +37,11 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """An estimate of the other clock minus the own clock, with guaranteed bounds.
-
-    The bounds are offset_ns +- half_ns at time `at_ns` of the own clock.
+    """An estimate of a clock offset: the time of another clock minus the time of the local clock.
 
     drift_ratio: estimated rate of change of the offset.
+
+    At the time `at_ns` of the local clock, the guaranteed bounds are offset_ns +- half_ns.
     """
 
     at_ns: int
@@ -51,7 +53,7 @@ class OffsetEstimate:
 def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -> Sample | None:
     """Compute the clock offset from a ping's four timestamps (ns).
 
-    t1, t4: times on the own clock when the ping was sent and when its reply was received.
+    t1, t4: times on the local clock when the ping was sent and when its reply was received.
     t2, t3: times on the other clock when the ping was received and when its reply was sent.
     max_drift_ratio: maximum relative drift of the clocks.
 
@@ -86,9 +88,9 @@ def fit_drift(samples: list[Sample]) -> tuple[float, float]:
     """Fit a line to the clock offsets by weighted least squares.
 
     Returns the value of the line at the newest sample, minus the offset of this sample (ns), and
-    the slope of the line. The weights are the inverse squares of the samples' bounds. Pings that
-    waited in a queue therefore have small weights. Both results are 0 if the samples span less than
-    `FIT_SPAN_NS`.
+    the slope of the line. The weights are the inverse squares of the half-widths of the samples'
+    bounds. Pings that waited in a queue have wide bounds and therefore small weights. Both results
+    are 0 if the samples span less than `FIT_SPAN_NS`.
     """
     newest = samples[-1]
     if newest.at_ns - samples[0].at_ns < FIT_SPAN_NS:
@@ -139,7 +141,7 @@ class OtherClock:
         samples.append(sample)
 
     def estimate(self, at_ns: int) -> OffsetEstimate | None:
-        """Estimate the clock offset at time `at_ns` of the own clock.
+        """Estimate the clock offset at time `at_ns` of the local clock.
 
         Returns None before the first sample.
         """

@@ -3,7 +3,7 @@
 By default, only users of this computer have access, and users of other computers need a token. A
 web page of another site that is open in a browser on this computer could connect to the console.
 Listening on the loopback address is therefore insufficient, and the Host and Origin headers of
-every request are checked. No other page may show the console in a frame, because a frame can hide
+every request are checked. Other pages must not show the console in a frame. Such a page could hide
 the element that the user clicks.
 """
 
@@ -51,13 +51,14 @@ MALFORMED = (
     "the console cannot read this HTTP request; open the address of the console in a browser"
 )
 CLOSE_TIMEOUT_S = 1.0
-"""The time for which a refused connection stays open. The client reads the reason in this time."""
+"""The time (s) for which a refused connection stays open, so that the client can read the reason
+for the refusal."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
 
 class ConsoleError(FlexsheetError, RuntimeError):
-    """An error of the console that prevents it from serving the page."""
+    """An error that prevents the console from serving the page."""
 
     code = "console"
     remedy = "Choose another port, or set a token if the page is open to the network."
@@ -66,8 +67,8 @@ class ConsoleError(FlexsheetError, RuntimeError):
 def read_token(path: Path) -> str:
     """Read the access token from a file.
 
-    Raises ConsoleError if the file cannot be read, if other users can read the file, or if the
-    token is too short or contains characters other than letters and digits.
+    Raises ConsoleError if the file cannot be read, or if other users can read the file. The error
+    is also raised if the token is too short, or contains characters other than letters and digits.
     """
     try:
         mode, text = path.stat().st_mode, path.read_text().strip()
@@ -91,8 +92,9 @@ def read_token(path: Path) -> str:
 class AccessControl:
     """The access control for HTTP and WebSocket requests to the console page.
 
-    address: IP address of the page. token: required token; None permits every user of this
-        computer.
+    address: IP address at which the page is served.
+    token: required token; None permits every user of this computer.
+
     Raises ConsoleError if the address is not a loopback address and there is no token.
     """
 
@@ -152,7 +154,10 @@ class AccessControl:
 
 
 def _names_an_address(host: str) -> bool:
-    """Return whether a Host header is an IP address or localhost; other names can be forged."""
+    """Return whether a Host header contains an IP address or localhost.
+
+    Another web site could make any other host name refer to this computer.
+    """
     try:
         name = urlsplit(f"//{host}").hostname or ""
         return name == "localhost" or bool(ipaddress.ip_address(name))
@@ -223,7 +228,7 @@ class PageConnection(ServerConnection):
     refused = False
 
     def send_data(self) -> None:
-        """Send the buffered data. If a request was malformed, a refusal is sent first."""
+        """Send the buffered data. If a request was malformed, send a refusal first."""
         malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
         if malformed and not self.refused and not self.transport.is_closing():
             self.refused = True
@@ -243,6 +248,7 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
     """Start a viser server with access control at the requested address and port.
 
     label: heading of the control panel.
+
     Raises ConsoleError if the port is in use, or if the installed version of viser does not support
     the access control.
     """
@@ -265,9 +271,9 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
 
 @contextmanager
 def _checking(access: AccessControl) -> Iterator[list[PageRequest]]:
-    """Add access control to all servers of the package websockets that start in the context.
+    """Add access control to every websockets server that starts while the context is active.
 
-    Yield the list of the request handlers that were replaced.
+    Yields a list to which the original request handler of each server is added.
     """
     serve = websockets.asyncio.server.serve
     checked_servers: list[PageRequest] = []

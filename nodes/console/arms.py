@@ -22,7 +22,8 @@ from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, tran
 class Piece:
     """A box that represents a part of a link, with size and centre (m) in the link's frame.
 
-    link: index of the link, where 0 is the base. dark: whether the box has the darker colour.
+    link: index of the link, where 0 is the base.
+    dark: whether the box has the darker colour.
     """
 
     link: int
@@ -55,8 +56,8 @@ BRACKET_WIDTH_M = 0.012
 """The width of the drawn bar between a flange and its clamp."""
 
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
-"""The size of the drawn clamp: width (m), ratio of its length to the edge length, and thickness
-(m)."""
+"""The size of the drawn clamp: width (m), ratio of the clamp's length to the edge length, and
+thickness (m)."""
 
 
 def compute_link_poses(
@@ -64,7 +65,9 @@ def compute_link_poses(
 ) -> Floats:
     """Compute the world poses (7, 4, 4) of the base and the six links of an arm.
 
-    world_from_base: pose (4, 4) of the base. joints_rad: joint angles (6,).
+    world_from_base: pose (4, 4) of the base.
+    joints_rad: joint angles (6,).
+
     The last pose is the pose of the flange.
     """
     chain = model.chain() if isinstance(model, ClosedFormArm) else model
@@ -79,7 +82,7 @@ def compute_link_poses(
 def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
     """Return the boxes that represent an arm.
 
-    For an arm without prepared boxes, the boxes connect successive joints.
+    If `PIECES` does not describe the arm, each box connects two successive joints.
     """
     if model == RV_1A:
         return PIECES
@@ -97,7 +100,8 @@ def rounded_box(
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Return vertices (24, 3), m, and triangles (44, 3) of a box with bevelled edges.
 
-    bevel: ratio of the bevel to half of the shortest side.
+    bevel: width of the bevel, divided by half of the shortest side.
+
     The triangles are counter-clockwise.
     """
     half = 0.5 * np.array(size_m)
@@ -110,7 +114,7 @@ def rounded_box(
 
 
 def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return vertices (n, 3), m, and triangles (t, 3) of the bar between a flange and its clamp.
+    """Return n vertices (n, 3), m, and t triangles (t, 3) of the bar between flange and clamp.
 
     flange_from_clamp_m: centre (3,) of the clamp in the flange frame.
     """
@@ -122,6 +126,6 @@ def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDAr
 
 
 def make_hull(points: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Return the convex hull of points (n, 3) as vertices (k, 3) and triangles (t, 3)."""
+    """Return the convex hull of n points (n, 3) as k vertices (k, 3) and t triangles (t, 3)."""
     hull = trimesh.convex.convex_hull(points)
     return np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int32)

@@ -15,7 +15,10 @@ from flexsheet.nodes.console.panels import MODES, make_paragraph
 
 
 class BannerState(IntEnum):
-    """The states that the banner shows. If several states apply, the largest value has priority."""
+    """The states that the banner shows.
+
+    If several states apply, the state with the largest value has priority.
+    """
 
     READY = 0
     WAITING = 1
@@ -44,11 +47,10 @@ class GraphState:
     scene: name of the scene.
     arms: states of the arms by side.
     estop_reason: reason of the engaged e-stop; None if no e-stop is engaged.
-    sheet: newest sheet target, or None.
+    sheet: newest sheet target; None before the first target.
     overload: sentence about an overloaded computer; empty if no computer is overloaded.
-    solver_note: note of the soft-body solver if it has no result for the scene yet, otherwise
-        empty.
-    replay: name of the replayed bag, or None.
+    solver_note: note of the soft-body solver; empty if the solver has a result for the scene.
+    replay: name of the replayed bag; None if no bag is replayed.
     """
 
     scene: str
@@ -140,7 +142,7 @@ def _describe(side: str, arm: ArmState) -> str:
 
 
 def _remedy(state: GraphState, shown: BannerState) -> str:
-    """Return a sentence about the action that the user must take, or an empty text."""
+    """Return a sentence about the action that the user must take; empty if there is none."""
     arms = state.arms.values()
     if shown is BannerState.ESTOP:
         return f"Release the stop when the arms are at rest; {_after_reset(state)}."

@@ -32,22 +32,22 @@ from flexsheet.nodes.console.state_file import ConsoleState, Sliders, load_state
 Publish = Callable[[Message], None]
 
 SETTLE_S = 0.4
-"""The time without motion of a slider after which the changed scene is published."""
+"""The time (s) for which no slider must move before the changed scene is published."""
 
 EYE_VIEW_PERIOD_S = 6.0
 PIXELS_EVERY = 3
 MAX_DRAWING_S = 5.0
-"""The maximum time to wait for a frame from the renderer."""
+"""The maximum time (s) to wait for a frame from the renderer."""
 
 CAPTURE_S = 1.0
-"""The time after a frame within which the simulated eye receives all its inputs."""
+"""The maximum time (s) after a frame until the simulated eye has received all its inputs."""
 
 MAX_TRACING_S = 120.0
-"""The maximum time to wait for the ray-traced image of the eye view."""
+"""The maximum time (s) to wait for the ray-traced image of the eye view."""
 
 DEFAULT_BOOKMARK = "bookmark"
 MAX_LABELS = 64
-"""The number of newest requests whose images are shown even if they arrive late."""
+"""The number of the newest requests whose images are shown even if they arrive late."""
 
 
 class SceneController:
@@ -62,7 +62,8 @@ class SceneController:
     ) -> None:
         """Start with the scene `first`.
 
-        publish: function that publishes a scene. folder: folder with the selectable scenes.
+        publish: function that publishes a scene.
+        folder: folder with the selectable scenes.
         sliders: slider positions that the previous console process saved; None if no slider was
             moved.
         """
@@ -75,9 +76,7 @@ class SceneController:
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
-        """Change to another scene of the run; raise SceneChoiceError if there is no scene of this
-        name.
-        """
+        """Change to another scene of the run; raise SceneChoiceError if the name is unknown."""
         self.base, self.moved = scenes.load(self._folder, name), False
         self.sliders = Sliders.from_scene(self.base)
         self._send(self.base)
@@ -91,7 +90,7 @@ class SceneController:
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Change the scene if the sliders have stopped moving, and return whether it changed.
+        """Change the scene if the sliders have stopped moving; return whether it has changed.
 
         Raises SceneChoiceError if the slider positions are invalid.
         """
@@ -114,11 +113,12 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Build, in a background thread, the picker with which the mouse selects points on the
-        object.
+        """Build the object that converts mouse positions to points on the virtual object.
 
-        finger: controller that moves the finger to the selected points. failed: function that
-        receives an error text if the object permits no selection.
+        finger: controller that moves the finger to the selected points.
+        failed: function that receives an error text if no points can be selected on the object.
+
+        The method returns before a background thread has built the object.
         """
         if self._picker_task is not None:
             self._picker_task.cancel()
@@ -150,9 +150,10 @@ class EyeViewState(Enum):
 class EyeViewRequester:
     """Request eye views, one at a time, because ray tracing takes a second of processor time.
 
-    For each view, the renderer draws one frame with pixels. From this frame, the simulated eye
-    computes the view. Afterwards, the previous display settings are restored. If no other node has
-    sent display settings, the image correction of the scene or of the console is restored.
+    For each view, the renderer draws one frame and publishes its pixels. From this frame, the
+    simulated eye computes the view. Afterwards, the previous display settings are restored. If no
+    other node has sent display settings, the image correction of the scene or of the console is
+    restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -236,10 +237,7 @@ class EyeViewRequester:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """End the request to which an image belongs.
-
-        Return whether this console has requested the image.
-        """
+        """End the request to which an image belongs; return whether this console requested it."""
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -262,8 +260,9 @@ class EyeViewRequester:
 class Replay:
     """The replay of a bag on the console page. A replay publishes no messages.
 
-    timeline: opened bag, or None. playing: whether the replay advances. rate: ratio of recorded
-        time to real time.
+    timeline: opened bag; None if no bag is open.
+    playing: whether the replay advances.
+    rate: ratio of recorded time to real time.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -289,7 +288,10 @@ class Replay:
         self.timeline, self.playing = None, False
 
     def seek(self, seconds: float) -> None:
-        """Jump to a time (s) since the start of the bag, limited to the bag's duration."""
+        """Jump to a time (s) since the start of the bag.
+
+        The time is limited to the bag's duration.
+        """
         if self.timeline is not None:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
@@ -319,7 +321,7 @@ class ConsoleFiles:
 
 
 class ReleaseError(FlexsheetError, ValueError):
-    """An error that is raised if the host of the console is not permitted to reset an e-stop.
+    """An error for a reset of an e-stop from a host that is not permitted to reset e-stops.
 
     The text names the hosts that are permitted to reset the e-stop.
     """
@@ -334,8 +336,9 @@ class ReleaseError(FlexsheetError, ValueError):
 class ConsoleController:
     """Publish e-stops, recordings and bookmarks, and save the state of the console.
 
-    warn: function that receives an error text if the saved state cannot be used. After a restart,
-    the console continues with the saved scene, sliders, finger and recording.
+    warn: function that receives an error text if the saved state cannot be used.
+
+    After a restart, the console continues with the saved scene, sliders, finger and recording.
     """
 
     def __init__(
@@ -418,6 +421,7 @@ def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> Consol
     """Load the saved state of the previous console process.
 
     warn: function that receives the cause if the saved state is invalid.
+
     If there is no valid state, the result contains the first scene of the plan.
     """
     try:

@@ -16,9 +16,10 @@ CREASE_RAD = 0.7
 def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.int64], Triangles]:
     """Duplicate the vertices at sharp edges, so that each side of an edge has its own vertices.
 
-    vertices, triangles: mesh with vertices (n, 3) and triangles (t, 3).
-    Returns the index (k,) of the original vertex for each new vertex, and the triangles (t, 3) with
-    indices of the new vertices.
+    vertices, triangles: mesh with n vertices (n, 3) and t triangles (t, 3).
+
+    Returns the indices (k,) of the original vertices for the k new vertices. The second result
+    contains the triangles (t, 3) with indices of the new vertices.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -21,6 +21,7 @@ class Ray:
     """A ray in the world frame that selects its first intersection with the object.
 
     direction: vector of any length except 0.
+
     Raises ValueError if a value is not finite, or if the length of the direction is 0.
     """
 
@@ -53,6 +54,7 @@ class FingerIntent:
     position: ray that selects a point on any object.
     depth_m: depth below the surface if the finger is not lifted.
     lifted: whether the finger hovers above the point.
+
     Raises ValueError if the depth is negative or not finite.
     """
 
@@ -70,8 +72,9 @@ class FingerIntent:
     def target_m(self, picker: SurfacePicker) -> Floats:
         """Return the requested position (3,), in m, of the fingertip in the world frame.
 
+        picker: object that selects points on the virtual object.
+
         The position is limited to the touchable surface and the working range of the scene.
-        picker: selector of points on the object.
         """
         origin, direction = np.array(self.position.origin_m), np.array(self.position.direction)
         return picker.pick(origin, direction, -HOVER_M if self.lifted else self.depth_m)
@@ -80,9 +83,11 @@ class FingerIntent:
 class FingerController:
     """A controller that moves the simulated finger to the requested position at a limited speed.
 
-    commanded: whether a viewer has moved the finger. position_m: requested position (x, y) as seen
-    from the front. Each step is published as a path of one point. Before the first command of a
-    viewer, nothing is published, and other programs can control the finger.
+    commanded: whether a viewer has moved the finger.
+    position_m: requested position (x, y) as seen from the front.
+
+    Each step is published as a path of one point. Before the first command of a viewer, nothing is
+    published, and other programs can control the finger.
     """
 
     def __init__(self, publish: Callable[[FingerPath], None], *, speed_m_per_s: float) -> None:
@@ -96,15 +101,15 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Use the points of a new object.
+        """Select points on a new virtual object from now on.
 
-        picker: selector of points on the object; None if the shape is unknown.
+        picker: object that selects points on the virtual object; None if the shape is unknown.
         """
         self._picker = picker
         self._update_target()
 
     def restore(self, intent: FingerIntent) -> None:
-        """Continue with the requested position that the previous console process has saved."""
+        """Continue with the requested position that the previous console process saved."""
         self.intent, self.commanded = intent, True
         self._update_target()
 
@@ -155,8 +160,8 @@ class FingerController:
     def advance(self, duration_s: float, measured: Floats | None) -> bool:
         """Publish the next step towards the target, and return whether it was the last step.
 
-        duration_s: duration of the step. measured: measured position (3,) of the finger, m; None if
-            the position is unknown.
+        duration_s: duration of the step.
+        measured: measured position (3,) of the finger, m; None if the position is unknown.
         """
         if self._target is None or self._picker is None or self._arrived:
             if measured is not None:

@@ -1,4 +1,4 @@
-"""Read from the plan of a run the constant properties of the graph that the console needs."""
+"""Read the constant properties of the graph that the console needs from the plan of a run."""
 
 from __future__ import annotations
 

@@ -25,16 +25,17 @@ class History:
     def add(self, now_s: float, source: MessageSource) -> None:
         """Add a sample, and remove samples that are older than half a minute.
 
-        now_s: current time. source: source of the messages.
+        now_s: current time.
+        source: source of the messages.
         """
         self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Return the times (n,), in s relative to the latest sample, and the latency series.
+        """Return the n times (n,), in s relative to the latest sample, and the latency series.
 
-        The series (n,) are in ms and contain NaN for missing values.
+        The series (n,) are in ms. If a value is missing, it is NaN.
         """
         if not self._samples:
             return (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES))
@@ -44,8 +45,9 @@ class History:
         return (times, *values.T)
 
     def latest_and_max(self) -> dict[str, tuple[float, float]]:
-        """Return the latest value and the maximum (ms) of each series, or NaN if there are no
-        samples.
+        """Return the latest value and the maximum (ms) of each series.
+
+        Both values are NaN if there are no samples.
         """
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
@@ -57,8 +59,10 @@ class History:
 def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     """Repeat isolated values of a chart, because the chart draws only lines between values.
 
-    columns: times (n,), s, and series (n,). A value between missing values is repeated at the time
-        of the previous sample. A single sample is repeated half a second earlier.
+    columns: n times (n,), s, and series (n,).
+
+    If a value is between two missing values, it is repeated at the time of the previous sample. If
+    there is only one sample, it is repeated half a second earlier.
     """
     times, *series = columns
     if len(times) == 1:
@@ -78,7 +82,8 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
 def read_latencies_ms(source: MessageSource) -> tuple[float, ...]:
     """Return the latencies (ms) from the exposure to the newest message of each processing step.
 
-    A latency is NaN if there is no message. The latency of the arms ends when the command is sent.
+    If a step has no message, its latency is NaN. The latency of the arms ends when the command is
+    sent.
     """
     missing = float("nan")
 

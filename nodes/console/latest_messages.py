@@ -35,9 +35,10 @@ class LatestMessages:
         self._refused = refused
 
     def put(self, name: str, frames: Any) -> bool:
-        """Store a message that is not decoded, and return whether it replaces an unread message.
+        """Store an encoded message, and return whether it replaces a message that was never read.
 
-        name: name of the topic. frames: encoded frames of the message.
+        name: name of the topic.
+        frames: encoded frames of the message.
         """
         unread = name in self._frames
         self._frames[name] = frames

@@ -1,4 +1,4 @@
-"""Serve a web page that shows and controls the running graph with all devices."""
+"""Serve a web page that shows and controls the running graph and its devices."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class ConsoleParameters(NodeParameters):
 class Console(Node):
     """A node that serves the console page.
 
-    While the page has viewers, the node decodes the latest messages at its own rates.
+    While viewers have opened the page, the node decodes the latest messages at its own rates.
     """
 
     takes_frames: ClassVar[bool] = True

@@ -43,7 +43,8 @@ MAX_WIDTH_PX = 340
 
 BAG_LIST_PERIOD_S = 5.0
 MAX_STEP_S = 0.2
-"""The maximum time step of the finger and of the replay. The limit prevents jumps after a pause."""
+"""The maximum time step (s) of the finger and of the replay. The limit prevents jumps after a
+pause."""
 
 SIDES = ("left", "right")
 BOOKMARKS_SHOWN = 5
@@ -138,7 +139,7 @@ class Operator:
         self._page.show_problem(str(error))
 
     def on_message(self, message: Message, header: Header, now_s: float) -> None:
-        """Process a message of a topic whose messages are all needed, not only the newest."""
+        """Process a message of a topic for which the page needs every message."""
         if isinstance(message, Status):
             self._statuses[message.node] = (message, now_s)
         elif isinstance(message, HostStatus):
@@ -363,7 +364,7 @@ class Operator:
 
     def _open_bag(self, name: str) -> None:
         if name == NO_BAG:
-            raise ValueError("there is no bag; record one first")
+            raise ValueError("there is no bag; record a bag first")
         self.controller.replay.open(name)
         self._page.record.show_replay(self.controller.replay, opened=True)
 

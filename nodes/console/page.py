@@ -32,9 +32,9 @@ class Page:
     ) -> None:
         """Build the panels.
 
-        request: function that passes a viewer's request to the node. with_finger: whether the page
-            has controls for the finger. others_may: other hosts that may reset an e-stop; empty if
-            the console's host may reset it.
+        request: function that passes a viewer's request to the node.
+        with_finger: whether the page has controls for the finger.
+        others_may: other hosts that may reset an e-stop; empty if the console's host may reset it.
         """
         self._gui: Any = server.gui
         self._request, self._others_may = request, others_may

@@ -17,10 +17,12 @@ from flexsheet.nodes.console.controller import EyeViewState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_RATIO = 0.5
-"""The fraction of a topic's minimum rate below which the topic is shown as slow."""
+"""The minimum ratio of a topic's actual rate to its minimum rate. If the ratio is lower, the topic
+is shown as slow."""
 
 MAX_STATUS_AGE_S = 3.0
-"""The age (s) of the last status message above which a node is shown as silent."""
+"""The maximum age (s) of a node's last status message. If the message is older, the node is shown
+as silent."""
 
 MODES = {
     "starting": "starting",
@@ -40,7 +42,8 @@ MODES = {
 class Line:
     """The style of a line in a chart.
 
-    color: colour that is visible on light and dark pages. dash: lengths of dashes and gaps, px.
+    color: colour that is visible on light and dark pages.
+    dash: lengths of dashes and gaps, px.
     """
 
     color: str
@@ -139,7 +142,8 @@ def make_topics_table(
     """Make the table of the topics with rate, maximum message age, and number of lost messages.
 
     statuses: latest status message of each node and its age (s), by the name of the node.
-    sampling_readers: nodes that skip messages by design, and are therefore not counted as readers.
+    sampling_readers: nodes that skip messages by design. The ages and losses of their messages are
+        ignored.
     """
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}
@@ -235,8 +239,8 @@ def eye(
 def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
     """Describe as HTML the state of the recorder and the newest bookmarks.
 
-    note: status note of the recorder node; None if there is no recorder. bookmarks: labels of the
-        bookmarks.
+    note: status note of the recorder node; None if there is no recorder.
+    bookmarks: labels of the bookmarks.
     """
     if note is None:
         return make_paragraph(_mark(WARN, "this graph has no recorder"))

@@ -1,4 +1,4 @@
-"""Compute the fingertip position that the mouse selects on the object, and a path to this point."""
+"""Compute the fingertip position that the mouse selects on the object, and a path to it."""
 
 from __future__ import annotations
 
@@ -24,15 +24,17 @@ RIM_MARGIN_M = 0.002
 
 SEARCH_POINTS, SEARCH_ROUNDS = 17, 2
 """The number of points on a line that are tested for the last touchable point, and the number of
-rounds. Each round tests the interval that the previous round found."""
+rounds of this search. Each round tests the interval that the previous round found."""
 
 
 class SurfacePicker:
-    """A selector of points on the object of a scene. Its construction takes a second for a mesh.
+    """A selector of points on the object of a scene.
 
-    Only points within the scene's working range are selected: the tilt and the depth are limited,
-    and a point beyond the rim of the touchable surface is replaced by a point before the rim.
     max_depth_m: maximum push depth of the working range.
+
+    If the object is a mesh, construction takes a second. Only points within the scene's working
+    range are selected. The tilt and the depth are limited. A point beyond the rim of the touchable
+    surface is replaced by a point before the rim.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -48,11 +50,13 @@ class SurfacePicker:
     def pick(self, origin: Floats, direction: Floats, depth_m: float) -> Floats:
         """Return the fingertip position (3,), in m, that a ray from the viewer's eye selects.
 
-        origin, direction: origin (3,), m, and direction (3,) of the ray in the world frame; the
-            direction is not zero.
-        The position is `depth_m` below the surface along the normal, at the point where the ray
-        meets the object, or else at the surface point nearest to the ray. A negative depth is
-        above the surface. The point and the depth are limited to the working range.
+        origin: origin (3,), m, of the ray in the world frame.
+        direction: direction (3,) of the ray in the world frame, which is not zero.
+
+        The ray selects the surface point where it meets the object. If the ray misses the object,
+        the surface point nearest to the ray is selected. The fingertip is `depth_m` below the
+        selected point along the normal. If the depth is negative, the fingertip is above the
+        surface. The point and the depth are limited to the working range.
         """
         direction = direction / np.linalg.norm(direction)
         travelled, nearest_m, nearest = 0.0, np.inf, origin
@@ -70,7 +74,8 @@ class SurfacePicker:
         """Return the point (3,), in m, at a depth below the touchable surface nearest to `near`.
 
         near: point (3,), m.
-        A negative depth results in a point above the surface.
+
+        If the depth is negative, the result is above the surface.
         """
         found = self._find_touchable(apply(self._object_from_world, near))
         inside = found.point - min(depth_m, self.max_depth_m) * found.normal
@@ -79,9 +84,10 @@ class SurfacePicker:
     def _find_touchable(self, near: Floats) -> Nearest:
         """Return the touchable surface point nearest to `near`, or a touchable point close to it.
 
-        near: point (3,) in the object's frame, m. The search starts at the front of the object. It
-        follows the straight line to the surface point nearest to `near`, and then the remaining
-        distance along the world's x and y axes.
+        near: point (3,) in the object's frame, m.
+
+        The search starts at the front of the object. It follows the straight line to the surface
+        point nearest to `near`, and then the remaining distance along the world's x and y axes.
         """
         found = self._shape.closest(near)
         outwards = found.point - self._front_m
@@ -98,6 +104,7 @@ class SurfacePicker:
         """Return the last touchable surface point on the path from `start` along `displacement`.
 
         start, displacement: touchable point (3,) and displacement (3,), m, in the object's frame.
+
         Points on the straight path are projected onto the surface.
         """
         margin = RIM_MARGIN_M / max(float(np.linalg.norm(displacement)), RIM_MARGIN_M)
@@ -117,10 +124,11 @@ class SurfacePicker:
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
         """Return the next point (3,), in m, on the path of the finger to the target.
 
-        finger, target: present and requested position (3,), m. The step is at most `max_step_m`
-        long. The step ends at most `depth_m` below the surface, or at the present depth if the
-        present depth is larger. If a step around the object makes no progress, the step is
-        straight.
+        finger, target: present and requested position (3,), m.
+
+        The step is at most `max_step_m` long. The step ends at most `depth_m` below the surface, or
+        at the present depth if the present depth is larger. If a step around the object makes no
+        progress, the step is straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

@@ -20,9 +20,10 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """A reader of the state that a recording had at a selected time.
+    """A reader of the last message of each topic up to a selected time in a bag.
 
     seconds: selected time since the start of the bag.
+
     Raises BagError if the file is not a bag, or contains no topic that the page shows.
     """
 
@@ -45,7 +46,10 @@ class Timeline:
         self.seconds = 0.0
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the last message of a topic at or before the selected time, or None."""
+        """Return the last message of a topic at or before the selected time.
+
+        The result is None if there is no such message.
+        """
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:
@@ -70,15 +74,15 @@ class Timeline:
         record = self._records(chunks[i]).get((self._channels[name], times[i]))
         if record is None:
             raise BagError(
-                f'{self.path}: topic "{name}": the index of the bag refers to a missing message; '
-                "the file is damaged, choose another bag"
+                f'{self.path}: topic "{name}": the index of the bag refers to a missing message, '
+                "so the file is damaged; choose another bag"
             )
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
-        """Return the messages of a chunk by channel and log time (ns).
+        """Return the messages of a chunk of the bag by channel and log time (ns).
 
-        Recently read chunks are cached.
+        Chunks that were read recently are cached.
         """
         cached = self._chunks.get(chunk.offset)
         if cached is None:

@@ -68,8 +68,8 @@ VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
     "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
     EYE_VIEW: None,
 }
-"""The camera position and the target point (m, world frame) of each view, or None for the user's
-eyes."""
+"""The camera position and the target point (m, world frame) of each view. The value is None for the
+view from the user's eyes."""
 
 Drag = Callable[[Floats, Floats], None]
 """A callback for a ray from the viewer's eye through the pointer, in the world frame. Its arguments
@@ -144,8 +144,8 @@ class SceneView:
     def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
         """Draw the object as the surface mesh of the soft-body solver.
 
-        rest: vertices (n, 3) of the undeformed object, world frame, m. triangles: vertex indices
-            (t, 3).
+        rest: n vertices (n, 3) of the undeformed object, world frame, m.
+        triangles: vertex indices (t, 3) of the t triangles.
         """
         self._skin_source, split = split_creases(rest, triangles)
         corners = _f32(rest[self._skin_source])
@@ -369,7 +369,7 @@ class SceneView:
 
 
 def lift_sheet(points: Floats, lift_m: float) -> Floats:
-    """Move the sheet's points (n, 3), in m, towards the user along the sheet's mean normal."""
+    """Move the sheet's n points (n, 3), in m, towards the user along the sheet's mean normal."""
     first, last = points[0], points[-1]
     right, left = points[COLUMNS - 1], points[-COLUMNS]
     normal = np.cross(right - left, last - first)
@@ -377,9 +377,9 @@ def lift_sheet(points: Floats, lift_m: float) -> Floats:
 
 
 def make_line_segments(points: Floats) -> Floats:
-    """Return line segments (k, 2, 3), m, along every fifth row and column of the sheet.
+    """Return k line segments (k, 2, 3), m, along every fifth row and column of the sheet.
 
-    points: vertices (n, 3) of the sheet.
+    points: n vertices (n, 3) of the sheet.
     """
     grid = points.reshape(ROWS, COLUMNS, 3)
     lines = np.concatenate([grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)])
@@ -387,7 +387,10 @@ def make_line_segments(points: Floats) -> Floats:
 
 
 def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices (n, 3), m, and triangles (t, 3) of a fingertip whose tip is the origin."""
+    """Return the mesh of a fingertip whose tip is at the origin.
+
+    The mesh has n vertices (n, 3), m, and t triangles (t, 3).
+    """
     tilt = np.linspace(0.0, 0.5 * np.pi, 8)
     radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m, 0.0]])
     ends = [FINGER_LENGTH_M, FINGER_LENGTH_M + 0.4 * radius_m]

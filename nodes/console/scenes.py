@@ -21,7 +21,7 @@ MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """An error that is raised if a scene cannot be used."""
+    """An error for a scene that cannot be used."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
@@ -53,6 +53,7 @@ def edit_scene(
     """Change the object's stiffness, the sheet's minimum stretch and the object's size.
 
     size_ratio: size relative to the size in `scene`.
+
     The front of the object stays in place, and the object grows away from the user. A rigid object
     stays rigid. Raises SceneChoiceError if a value is invalid.
     """
@@ -75,8 +76,8 @@ def edit_scene(
         if stretch_ratio > limit + STRETCH_STEP:
             raise SceneChoiceError(
                 f"tension: {100 * (stretch_ratio - 1):.1f} % is above {100 * (limit - 1):.1f} %, "
-                "the limit by max_stretch_ratio and max_edge_force_n of the scene's sheet; lower "
-                "the tension"
+                "the maximum that max_stretch_ratio and max_edge_force_n of the scene's sheet "
+                "permit; lower the tension"
             )
         values["sheet"] = _with(sheet, min_stretch_ratio=min(stretch_ratio, limit))
         return Scene(**values)
@@ -118,9 +119,11 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return the extent (m) of an object's touchable surface from its origin towards the user.
+    """Return how far (m) an object's touchable surface extends from its origin to the user.
 
     world_from_object: rotation matrix (3, 3) of the object.
-    The user is in the direction of the world's z axis. The ends of a cylinder are not touchable.
+
+    The distance is measured along the world's z axis, which points to the user. The ends of a
+    cylinder are not touchable.
     """
     return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

@@ -17,7 +17,7 @@ from flexsheet.nodes.models.sheet import corners, sheet_from_edges
 
 COLUMNS, ROWS = 41, 41
 TRIANGLES = triangulate_grid(ROWS, COLUMNS)
-"""The triangles (t, 3) of the sheet's grid, which are counter-clockwise as seen by the user."""
+"""The t triangles (t, 3) of the sheet's grid, which are counter-clockwise as seen by the user."""
 MIN_EDGE_DISTANCE_M = 0.05
 MIRRORED = 2
 """The number of mirror images of the finger beyond each free edge."""
@@ -34,8 +34,9 @@ def compute_sheet_points(
     """Compute the world positions (ROWS * COLUMNS, 3), in m, of the drawn sheet's vertices.
 
     world_from_left_edge, world_from_right_edge: poses (4, 4) of the sheet's edges.
-    fingertip: position (3,) in the world frame, m, or None.
-    Rows are ordered upwards, and columns to the right. Return None if the distance between the
+    fingertip: position (3,) in the world frame, m; None if it is unknown.
+
+    Rows are ordered upwards, and columns to the right. Returns None if the distance between the
     edges is less than `MIN_EDGE_DISTANCE_M`.
     """
     left, right = world_from_left_edge, world_from_right_edge
@@ -60,12 +61,15 @@ def compute_sheet_points(
 def film(
     x: Floats, y: Floats, finger: tuple[float, float], size_m: tuple[float, float], radius_m: float
 ) -> Floats:
-    """Compute the deflection (n,) of a film that is clamped at x = +-width / 2.
+    """Compute the deflection (n,) of a film that is clamped at x = +-width / 2, at n points.
 
-    x, y: coordinates (n,) of the points, m. finger: position (x, y), m. size_m: width and height of
-    the film. The result is relative to the depth of the finger, and it is 1 within `radius_m` of
-    the finger. The deflection solves Laplace's equation for a point force in an infinite strip. Its
-    Green's function follows from a conformal map. The free edges at y = +-height / 2 are
+    x, y: coordinates (n,) of the points, m.
+    finger: position (x, y) of the finger, m.
+    size_m: width and height of the film.
+
+    The deflection is relative to the depth of the finger, and it is 1 within `radius_m` of the
+    finger. It solves Laplace's equation for a point force in an infinite strip. The Green's
+    function of this problem follows from a conformal map. The free edges at y = +-height / 2 are
     represented by mirror images of the finger.
     """
     width_m, height_m = size_m
@@ -84,7 +88,8 @@ def film(
 def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
     """Compute Green's function (n,) of Laplace's equation in the strip |x| < pi / 2.
 
-    x, y: coordinates (n,) of the points.
+    x, y: coordinates (n,) of n points.
+
     The source is at (source_x, 0). The result is not normalized.
     """
     high = np.cosh(np.minimum(np.abs(y), 30.0))
@@ -94,6 +99,6 @@ def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
 
 @lru_cache(maxsize=1)
 def _fractions() -> tuple[Floats, Floats]:
-    """Return the positions of the grid's vertices as fractions (n, 1) of width and height."""
+    """Return the positions of the n grid vertices as fractions (n, 1) of width and height."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)

@@ -1,6 +1,6 @@
 """Compute the contents of the 3D view at one time, as arrays in the world frame.
 
-The skin is the surface mesh of the soft object.
+The "skin" is the surface mesh of the soft object.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.models.shapes.triangles import intersect_rays, triangulate_grid
 
 RAY_POSITIONS = (-0.55, 0.0, 0.55)
-"""The positions of the drawn light rays, as fractions of half the object's width and height."""
+"""The positions at which light rays are drawn, as fractions of half the object's width and height.
+"""
 RAY_TRIANGLES = triangulate_grid(ROWS // 2 + 1, COLUMNS // 2 + 1)
-"""The triangles (t, 3) between every second row and column of the drawn sheet."""
+"""The t triangles (t, 3) between every second row and column of the drawn sheet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +32,11 @@ class SceneSnapshot:
 
     links: poses (7, 4, 4) of each arm's links, by side.
     edges: pose (4, 4) of each clamped edge, by side.
-    sheet: points (n, 3) of the sheet.
-    skin: deformed vertices (s, 3) of the object's surface mesh.
-    finger: position (3,) of the fingertip. finger_valid: whether the fingertip is tracked.
+    sheet: n points (n, 3) of the sheet.
+    skin: s deformed vertices (s, 3) of the object's surface mesh.
+    finger: position (3,) of the fingertip.
+    finger_valid: whether the fingertip is tracked.
+
     Lengths are in m. A value is None if it is unknown.
     """
 
@@ -77,9 +80,9 @@ def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
 
 
 def _skin(source: MessageSource) -> Floats | None:
-    """Return the vertices (n, 3), m, of the object's surface mesh.
+    """Return the n vertices (n, 3), m, of the object's surface mesh.
 
-    Before the first result of the solver, these are the vertices of the undeformed object.
+    Before the first result of the solver, the vertices of the undeformed object are returned.
     """
     skin, body = source.latest("skin", Skin), source.latest("soft_body", SoftBody)
     if skin is None:
@@ -93,7 +96,8 @@ def _skin(source: MessageSource) -> Floats | None:
 def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
     """Select nine vertices in a grid on the user's side, at which light rays are drawn.
 
-    rest: vertices (n, 3) of the undeformed object, m.
+    rest: n vertices (n, 3) of the undeformed object, m.
+
     Returns the indices (9,) of the vertices.
     """
     low, high = rest.min(axis=0), rest.max(axis=0)
@@ -108,12 +112,13 @@ def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
 
 
 def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Compute the light rays by which the eye sees points (n, 3), in m, of the deformed surface.
+    """Compute the light rays by which the eye sees n points (n, 3), in m, of the deformed surface.
 
     sheet: points of the drawn sheet.
+
     Returns k segments (k, 2, 3) from the eye to the sheet, and k segments (k, 2, 3) from the sheet
-    to the projector. A point whose ray misses the sheet has no segments. The result is empty if the
-    scene has no projector.
+    to the projector. If a ray misses the sheet, its point has no segments. The result is empty if
+    the scene has no projector.
     """
     if scene.projector is None:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))

@@ -40,9 +40,10 @@ class Sliders:
 class ConsoleState(BaseModel):
     """The saved state of a console.
 
-    base: selected scene. sliders: slider positions; None if no slider was moved. recording: whether
-        a viewer has requested a recording. finger: requested finger position; None if no viewer has
-        moved the finger.
+    base: selected scene.
+    sliders: slider positions; None if no slider was moved.
+    recording: whether a viewer has requested a recording.
+    finger: requested finger position; None if no viewer has moved the finger.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -54,7 +55,7 @@ class ConsoleState(BaseModel):
 
 
 def load_state(path: Path) -> ConsoleState | None:
-    """Read the saved state of a console; return None if there is no file.
+    """Read the saved state of a console; return None if the file does not exist.
 
     Raises SceneChoiceError if the file is invalid.
     """

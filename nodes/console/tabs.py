@@ -148,8 +148,9 @@ class TouchTab:
     def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
         """Show the values of a scene in the controls.
 
-        base: scene before it was changed by the sliders. names: names of all scenes. sliders:
-            slider positions.
+        base: scene before it was changed by the sliders.
+        names: names of all scenes.
+        sliders: slider positions.
         """
         if names:
             self._scene.options = tuple(names)
@@ -232,7 +233,7 @@ def _scales(top_ms: float) -> dict[str, Any]:
 def max_latency_ms(columns: tuple[Floats, ...]) -> float:
     """Return the upper limit of the chart's scale, ms: 1, 2, 5, 10 and so on.
 
-    columns: times (n,), s, and latency series (n,), ms.
+    columns: n times (n,), s, and latency series (n,), ms.
     """
     values = np.concatenate(columns[1:])
     largest = float(values[np.isfinite(values)].max(initial=1.0))
@@ -319,7 +320,7 @@ class RecordTab:
     def show_bags(self, names: Sequence[str], recorded: str | None = None) -> None:
         """List the bags in the selection control.
 
-        recorded: bag that has just been recorded, which is then selected; None selects no bag.
+        recorded: bag that has just been recorded; this bag is selected. None selects no bag.
         """
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:
@@ -330,7 +331,7 @@ class RecordTab:
     def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
         """Show the current time in the replayed bag.
 
-        opened: whether the shown bag has changed.
+        opened: whether a bag has been opened or closed since the last call.
         """
         timeline = replay.timeline
         if opened:

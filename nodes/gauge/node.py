@@ -47,7 +47,7 @@ class GaugeParameters(NodeParameters):
         description="time from a measurement to its arrival, including the gauge's filter, s",
     )
     silence_s: Positive = Field(
-        default=1.0, description="time without a reading until the force is invalid, s"
+        default=1.0, description="time without a reading after which the force is invalid, s"
     )
     watch_hz: Positive = Field(
         default=2.0,

@@ -15,7 +15,10 @@ NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 class GaugeError(FlexsheetError, OSError):
-    """Raised if a gauge cannot be opened or read. The text names the device and the cause."""
+    """An error for a gauge that cannot be opened or read.
+
+    The error text names the device and the cause.
+    """
 
     code = "gauge"
     remedy = "Check the cable, the path in `port`, and the permission to open it (group dialout)."
@@ -48,7 +51,11 @@ class SerialGauge:
         except (OSError, termios.error) as error:
             self.close()
             reason = error.strerror if isinstance(error, OSError) else error.args[-1]
-            raise GaugeError(0, f"{port}: cannot be opened as a serial port: {reason}") from error
+            raise GaugeError(
+                0,
+                f"{port}: cannot be opened as a serial port: {reason}; check the path and the "
+                "permissions",
+            ) from error
 
     def fileno(self) -> int:
         """Return the file descriptor on which the caller can wait for data."""
@@ -61,9 +68,14 @@ class SerialGauge:
         except BlockingIOError:
             return []
         except OSError as error:
-            raise GaugeError(0, f"{self.port}: cannot be read: {error.strerror}") from error
+            raise GaugeError(
+                0, f"{self.port}: cannot be read: {error.strerror}; check the cable of the gauge"
+            ) from error
         if not data:
-            raise GaugeError(0, f"{self.port}: the device has closed the connection")
+            raise GaugeError(
+                0,
+                f"{self.port}: the device has closed the connection; check the cable of the gauge",
+            )
         *lines, rest = re.split(rb"[\r\n]+", self._rest + data)
         self._rest = rest[-MAX_LINE_BYTES:]
         found = [parse_line(line) for line in lines if line.strip()]

@@ -8,10 +8,10 @@ r(d) behind the tangent plane:
     F_sheet(stretch, d - r(d)) = F_object(d).
 
 The sheet retreats if the offset increases with the depth, and advances if the offset decreases. The
-sheet follows with a delay, so a retreat damps slow pushes, and an advance adds energy. The module
-`hand_loop` computes the largest slopes dr/dd at which the control loop with any hand is stable. The
-lowest stretch that renders the force without an advance is chosen. If every stretch requires an
-advance, the stretch with the smallest advance is chosen.
+sheet follows the finger with a delay. A retreat therefore damps slow pushes, and an advance adds
+energy. The module `hand_loop` computes the largest slopes dr/dd at which the control loop with any
+hand is stable. The lowest stretch that renders the force without an advance is chosen. If every
+stretch requires an advance, the stretch with the smallest advance is chosen.
 
 The sheet does not advance at forces that are too small to be felt. Otherwise the sheet would
 respond to the noise of the camera while a finger strokes the object.
@@ -46,39 +46,41 @@ from flexsheet.nodes.models.sheet.tension import (
 )
 
 USABLE_FRACTION = 0.85
-"""The fraction of the maximum edge force and strain that the planner uses.
+"""The fraction of the maximum edge force and of the maximum strain that the planner uses.
 
 The margin is necessary because each arm receives the state of the other arm one or two control
 cycles late."""
 
 FORCE_JND_FLOOR_N = 0.05
-"""The smallest force that can be felt, which is also the minimum divisor of relative errors."""
+"""The smallest force (N) that a user can feel. It is also the minimum divisor of relative errors.
+"""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""The contact forces (maximum of the object's and the sheet's force) between which the sheet's
-advance increases from zero to its full value."""
+"""The contact forces (N) between which the sheet's advance increases from zero to its full value.
+The contact force is the larger of two forces: the object's force and the sheet's force."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
-"""The depths between which the sheet's advance increases from zero to its full value."""
+"""The depths (m) between which the sheet's advance increases from zero to its full value."""
 
 TARGET_ERROR_RATIO = 0.10
 """The relative error of the rendered force above which the planner reports the error."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
 """The smallest relative differences of stiffness that users notice. The first value applies if the
-skin deforms (Bergmann Tiest & Kappers 2009). The second applies if users can compare neither work
-nor final force (Tan et al. 1995)."""
+skin of the finger deforms (Bergmann Tiest & Kappers 2009). The second value applies if users can
+compare neither work nor final force (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""The maximum advance of the sheet towards the finger per depth of the push. At this value, the
-sheet feels 1.5 times as stiff as without an advance. The bounds for a stable loop with the hand are
-usually lower."""
+"""The maximum advance of the sheet towards the finger, divided by the depth of the push. At this
+value, the sheet feels 1.5 times as stiff as without an advance. The bounds that keep the control
+loop with the hand stable are usually lower."""
 
 SLOPE_TOLERANCE = 0.03
-"""The tolerance of slopes with respect to their bounds, which contain larger safety margins."""
+"""The tolerance by which slopes may exceed their bounds. The bounds contain larger safety margins.
+"""
 
 STRETCH_CANDIDATES = 17
-"""The number of stretch ratios that are tried between the minimum and the maximum ratio."""
+"""The number of stretch ratios between the minimum and the maximum ratio that are tried."""
 
 
 class UnfitCurveError(FlexsheetError, ValueError):
@@ -90,10 +92,10 @@ class UnfitCurveError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ObjectCurve:
-    """The force of an object as a function of depth, given by n ascending points from (0, 0).
+    """The force of an object as a function of depth, given by n points that start at (0, 0).
 
     The curve is a monotone cubic between the points, and a line beyond the last point. Raises
-    UnfitCurveError if the points are not finite or not ascending.
+    UnfitCurveError if a point is not finite, if the depths do not ascend, or if the forces fall.
     """
 
     depths_m: Floats
@@ -116,16 +118,21 @@ class ObjectCurve:
                 "0 m, 0 N"
             )
         if (np.diff(depths) <= 0.0).any() or (np.diff(forces) < 0.0).any():
-            raise UnfitCurveError("force curve: the depths must ascend, the forces must not fall")
+            raise UnfitCurveError(
+                "force curve: the depths must ascend, and the forces must not fall"
+            )
         object.__setattr__(self, "_curve", scipy.interpolate.PchipInterpolator(depths, forces))
 
     @classmethod
     def from_rows(cls, rows: Floats) -> ObjectCurve:
-        """Make the curve from an array (n, 2) with the columns depth (m) and force (N)."""
+        """Make the curve from n points.
+
+        rows: array (n, 2) with the depth (m) in column 0 and the force (N) in column 1.
+        """
         return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
 
     def force_n(self, depths_m: Floats) -> Floats:
-        """Return the forces (n,), N, at depths (n,), m; the force is 0 for negative depths."""
+        """Return the n forces (n,), N, at the depths (n,), m; the force is 0 at negative depths."""
         last = self.depths_m[-1]
         inside = self._curve(np.clip(depths_m, 0.0, last))
         beyond = np.maximum(np.asarray(depths_m) - last, 0.0)
@@ -149,7 +156,7 @@ class StretchLimits:
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
         """Return the maximum advance (n,) of the sheet towards the finger per depth of the push.
 
-        stiffnesses_n_per_m: stiffnesses (n,) of the sheet.
+        stiffnesses_n_per_m: n stiffnesses (n,) of the sheet.
         """
         result = np.full(len(stiffnesses_n_per_m), MAX_ADVANCE_PER_DEPTH)
         if self.bounds is None:
@@ -162,11 +169,11 @@ class StretchLimits:
 def make_stretch_limits(
     sheet: SheetSpec, model: SheetForceModel, bounds: OffsetBounds | None = None
 ) -> StretchLimits:
-    """Return the limits of the stretch within the usable fraction of the scene's limits.
+    """Return the limits of the stretch that use the fraction USABLE_FRACTION of the scene's limits.
 
-    bounds: bounds on the slope of the offset for a stable control loop of sheet and hand.
+    bounds: bounds on the slope of the offset that keep the control loop of sheet and hand stable.
 
-    The limit of the edge force refers to a sheet that nothing touches. `render_force` limits the
+    The limit of the edge force applies while nothing touches the sheet. `render_force` limits the
     additional edge force of a push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
@@ -194,7 +201,7 @@ class RenderedForce:
 
     indentation_m: deflection of the sheet from its plane under the finger.
     edge_force_n: force on each clamp.
-    advance_per_depth: maximum advance of the sheet towards the finger per depth.
+    advance_per_depth: maximum advance of the sheet towards the finger, divided by the depth.
     force_limited: whether the limit of the edge force has reduced the indentation.
     """
 
@@ -209,14 +216,14 @@ class RenderedForce:
 
     @property
     def normal_offset_m(self) -> Floats:
-        """Return the distance (n,), in m, of the sheet behind the object's tangent plane."""
+        """Return the n distances (n,), m, of the sheet behind the object's tangent plane."""
         return self.depths_m - self.indentation_m
 
     @property
     def error_ratio(self) -> Floats:
-        """Return the relative errors (n,) of the rendered forces.
+        """Return the relative errors (n,) of the rendered forces at n depths.
 
-        The error is 0 for forces that cannot be felt.
+        The error is 0 for forces that users cannot feel.
         """
         felt = np.maximum(self.object_force_n, self.force_n) >= FORCE_JND_FLOOR_N
         difference = (self.force_n - self.object_force_n) / np.maximum(
@@ -235,7 +242,8 @@ between the control points bound the slope of the spline. Bounds that hold at th
 hold at all depths."""
 
 SATURATION_FRACTION = 0.1
-"""The fraction of the maximum indentation over which the indentation saturates smoothly."""
+"""The fraction of the maximum indentation over which the indentation approaches its maximum
+smoothly."""
 
 
 def render_force(
@@ -251,8 +259,8 @@ def render_force(
     push: stretch ratio, finger radius and position of the push.
     max_depth_m: maximum depth of the finger in the object.
 
-    The edge force limits the indentation. The indentation increases by at most
-    1 + `limits.max_advance` times the increase of the depth.
+    The limit of the edge force limits the indentation. The indentation increases by at most 1 +
+    `limits.max_advance` times the increase of the depth.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
@@ -300,8 +308,8 @@ def _indentation_for_edge_force(
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
     """Reduce the sheet's advance smoothly to zero at small depths and small contact forces.
 
-    depths, indentation: depths and indentations (n,), m.
-    forces_n: contact forces (n,).
+    depths, indentation: n depths and indentations (n,), m.
+    forces_n: contact forces (n,) at these depths.
 
     Returns the changed indentations (n,), m.
     """
@@ -316,7 +324,7 @@ def _fade(values: Floats, start: float, end: float) -> Floats:
 
 
 def _saturate(indentation: Floats, maximum: float) -> Floats:
-    """Limit indentations (n,), m, to a maximum that they approach smoothly."""
+    """Limit n indentations (n,), m, to a maximum that they approach smoothly."""
     if maximum <= 0.0:
         return np.zeros_like(indentation)
     knee, span = (1.0 - SATURATION_FRACTION) * maximum, SATURATION_FRACTION * maximum
@@ -352,8 +360,9 @@ class Compliance:
         return float(self.centre.depths_m[-1])
 
     def indentation_m(self, depths_m: Floats | float, position_m: SheetPosition = CENTRE) -> Floats:
-        """Return the sheet's indentations (n,), m, at depths (n,), m, of the finger in the object.
+        """Return the sheet's indentations (n,), m, at n depths of the finger in the object.
 
+        depths_m: depths (n,).
         position_m: (x, y) of the contact on the sheet.
         """
         depths = np.clip(np.asarray(depths_m, dtype=np.float64), 0.0, self.max_depth_m)
@@ -365,8 +374,8 @@ class Compliance:
     ) -> Floats:
         """Return the sheet's distances (n,), m, behind the object's tangent plane.
 
-        depths_m: depths (n,) of the finger in the object. If there is no contact, the distance is
-            0.
+        depths_m: n depths (n,) of the finger in the object. If a depth is not positive, there is no
+            contact, and the distance is 0.
         position_m: (x, y) of the contact on the sheet.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
@@ -374,7 +383,7 @@ class Compliance:
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the derivative of the normal offset with respect to the depth, at most 1."""
+        """Return the derivative of the normal offset with respect to the depth; it is at most 1."""
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:
@@ -401,15 +410,15 @@ class Compliance:
         return float(bounds.bandwidths_rad_per_s[0]), False
 
     def rendered_force_n(self, depths_m: Floats, position_m: SheetPosition = CENTRE) -> Floats:
-        """Return the forces (n,), N, that the sheet's model predicts at depths (n,), m."""
+        """Return the forces (n,), N, that the sheet's model predicts at n depths (n,), m."""
         push = SheetPush(self.stretch_ratio, self.finger_radius_m, position_m)
         return self.model.evaluate(push, self.indentation_m(depths_m, position_m)).force_n
 
     def _weights(self, position_m: SheetPosition) -> Floats:
-        """Return the weights (9,) for interpolation between the positions of `_nodes`.
+        """Return the weights (9,) for interpolation between the nine positions of `_nodes`.
 
         The interpolation is linear in x^2 and y^2. No weight is negative, so bounds that hold at
-        these positions hold between them.
+        these positions also hold between them.
         """
         weights = [
             _interpolate_squares(nodes, abs(at))
@@ -419,7 +428,7 @@ class Compliance:
 
 
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
-    """Return the weights (n,) for an interpolation that is linear in the squared coordinate.
+    """Return the n weights (n,) of an interpolation that is linear in the squared coordinate.
 
     nodes: coordinates (n,) of the known values.
     at: coordinate of the interpolated value.
@@ -509,10 +518,11 @@ def _find_best_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Return a warning about forces that the sheet cannot render, or "" if there are none.
+    """Return a warning about forces that the sheet cannot render, or "" if it can render all.
 
-    position_error_m: error of the sheet's position. The text also warns of objects so soft that
-        this error changes the force noticeably.
+    position_error_m: error of the sheet's position.
+
+    The text also warns if the object is so soft that this error changes the force noticeably.
     """
     error = rendered.error_ratio
     off = np.abs(error) > TARGET_ERROR_RATIO
@@ -543,7 +553,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
 
 
 def compute_force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
-    """Return the relative change of the force at maximum depth that a position error (m) causes."""
+    """Return the relative change of the force at the maximum depth due to a position error (m)."""
     change = float(rendered.stiffness_n_per_m[-1]) * position_error_m
     return change / max(float(rendered.object_force_n[-1]), 1e-9)
 
@@ -558,7 +568,8 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, str]:
     """Return the stretch that renders an object's stiffness at small pushes without an offset.
 
-    The second result is a text if the sheet cannot render the stiffness, otherwise it is empty.
+    The second result is a text about a stiffness that the sheet cannot render. It is empty if the
+    sheet can render the stiffness.
 
     The sheet is modelled as linear, and the fingertip as a point.
     """

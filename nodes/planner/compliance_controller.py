@@ -22,14 +22,15 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 
 EQUAL_RATIO = 0.02
-"""The relative difference below which two force curves are equal. Users notice only differences
-that are seven times as large."""
+"""The relative difference below which two force curves count as equal. Users notice only
+differences that are at least seven times as large."""
 
 FIRST_DELAY_S = 0.06
 """The initial value of the delay between the measurement of a depth and the motion of the sheet."""
 
 DELAY_HYSTERESIS_S = 0.03
-"""The minimum decrease of the measured delay that leads to new bounds on the offset's slope."""
+"""The minimum decrease (s) of the measured delay after which new bounds on the offset's slope are
+computed."""
 
 COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 """The depths at which force curves are compared, as fractions of the maximum depth."""
@@ -41,10 +42,10 @@ class ComplianceController:
     mode: "force_curve" renders the object's force as a function of depth. "stiffness" renders the
         object's stiffness at small pushes by the stretch (Furukawa et al. 2007). "constant_stretch"
         uses the minimum stretch.
-    hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle; None to use
-        the value in the scene.
-    bounds: bounds on the offset's slope for a stable control loop with the hand; None if no hand is
-        considered.
+    hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle. None means
+        that the value in the scene is used.
+    bounds: bounds on the offset's slope that keep the control loop with the hand stable; None if no
+        hand is considered.
     delay_s: time from the measurement of a depth until the sheet has moved.
     bandwidth_rad_per_s: bandwidth of the depth filter; None if there are no bounds.
     """
@@ -78,7 +79,8 @@ class ComplianceController:
         """Fit the stretch and the offset of the sheet to the soft body under the finger.
 
         The stretch remains constant during contact, because users would feel the motion of the
-        edges. Raises UnfitCurveError if the force curve is invalid; the last fit then stays in use.
+        edges. If the force curve is invalid, the method raises UnfitCurveError and keeps the last
+        fit.
         """
         if self._mode == "constant_stretch":
             return
@@ -102,8 +104,8 @@ class ComplianceController:
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
         """Set the delay from the measurement of a depth to the motion of the sheet.
 
-        If the new delay changes the stability bounds of the offset, and the finger does not touch
-        the sheet, stretch and offset are fitted to the object's force curve again.
+        If the new delay changes the stability bounds of the offset, stretch and offset are fitted
+        to the object's force curve again. They are not fitted while the finger touches the sheet.
         """
         self.delay_s = delay_s
         if self._bounds is None or in_contact:
@@ -160,8 +162,8 @@ class ComplianceController:
         depth_m: depth of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
 
-        A positive offset is behind the object's tangent plane. If the hysteresis is corrected, the
-        result also depends on the depths of earlier calls.
+        If the offset is positive, the sheet is behind the object's tangent plane. If the hysteresis
+        is corrected, the result also depends on the depths of earlier calls.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:

@@ -34,8 +34,8 @@ contact is the surface point nearest to the finger. Above the second ratio, the 
 as the finger moves along the sheet."""
 
 MIN_RADIUS_FRACTION = 0.15
-"""The minimum distance of a finger from a centre of curvature, as a fraction of the radius. Nearer
-to the centre, the side of the object is ambiguous."""
+"""The minimum distance of a finger from a centre of curvature, as a fraction of the radius of
+curvature. Nearer to the centre, the side of the object that the finger touches is ambiguous."""
 
 MIN_CURVATURE_PER_M = 1e-3
 MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
@@ -49,7 +49,8 @@ RIM_RADIUS_M = 0.03
 """The radius around the contact in which a finger deforms the sheet."""
 
 MIN_LIFT_M = 2e-4
-"""The minimum height of the surrounding surface above a contact that is reported as concave."""
+"""The minimum height (m) of the surface around a contact above the contact's tangent plane. If the
+surface is higher, the contact is reported as concave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,8 +229,8 @@ class ContactStateMachine:
     ) -> tuple[SheetContact, SheetReason | None]:
         """Roll the sheet on the object until the contact is at the surface point `found`.
 
-        The contact stays within the usable area of the sheet. The second result is the violated
-        limit, or None if no limit is violated.
+        The contact stays within the usable area of the sheet. The second result is the limit that
+        stops the contact before this point, or None if no limit does.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
@@ -275,5 +276,5 @@ def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
 
 
 def _norm(vector: Floats) -> float:
-    """Return the length of a vector (3,), not finite if an element is not finite."""
+    """Return the length of a vector (3,); it is not finite if an element is not finite."""
     return hypot(*vector.tolist())

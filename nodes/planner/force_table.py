@@ -21,7 +21,7 @@ from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import compute_membrane_table, make_rubber
 
 VERSION = 1
-"""The version of the computation. Cached tables of another version are computed again."""
+"""The version of the computation. A cached table of another version is computed again."""
 
 FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
 """The fields of `TabulatedSheetModel` that the cache file contains."""
@@ -79,7 +79,7 @@ def load_force_model(
 ) -> tuple[SheetForceModel, str]:
     """Return the force model of an uncalibrated sheet, and a note for the operator.
 
-    If the method is "table" but the cache contains no table, the scaled model is returned.
+    If the method is "table" but the cache contains no table, a `ScaledSheetModel` is returned.
     """
     rubber = make_rubber(scene.sheet)
     if method != "table":

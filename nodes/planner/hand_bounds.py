@@ -15,7 +15,7 @@ from flexsheet.nodes.models.hand_loop import OffsetBoundsTable, compute_offset_b
 from flexsheet.nodes.planner.compliance import MAX_ADVANCE_PER_DEPTH
 
 VERSION = 2
-"""The version of the computation. Cached tables of another version are computed again."""
+"""The version of the computation. Cached bounds of another version are computed again."""
 
 
 def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:

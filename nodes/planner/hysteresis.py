@@ -2,19 +2,19 @@
 
 While the finger moves inwards (loading), the force is 1 + h times the elastic force. While the
 finger moves outwards, the force is 1 - h times the elastic force. Here h = r / (2 - r), and r is
-the fraction of the loading energy that the rubber loses. After a reversal, the factor changes
-linearly with the finger's travel.
+the fraction of the loading energy that the rubber loses. After the finger reverses its direction,
+the factor changes linearly with the finger's travel.
 """
 
 from __future__ import annotations
 
 REVERSAL_RATIO = 0.2
-"""The travel of the finger after a reversal until the hysteresis is fully reversed, as a fraction
-of the depth."""
+"""The travel of the finger after which the hysteresis has fully reversed, as a fraction of the
+depth. The travel begins when the finger reverses its direction."""
 
 MIN_REVERSAL_M = 4e-4
-"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. If the
-value were smaller, tremor would reverse the hysteresis at small depths."""
+"""The minimum travel (m) of the finger after which the hysteresis has fully reversed. If the value
+were smaller, tremor would reverse the hysteresis at small depths."""
 
 
 class HysteresisCorrection:

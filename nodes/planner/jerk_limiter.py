@@ -43,8 +43,8 @@ class JerkBounds:
 class JerkLimitedState:
     """The motion of the sheet and the state of the jerk limiter.
 
-    mean_velocity, acceleration: values (7,) for translation (3), rotation (3) and stretch ratio
-        (1), averaged over the last time step.
+    mean_velocity, acceleration: averages (7,) over the last time step. Three elements describe the
+        translation, three the rotation, and one the stretch ratio.
     """
 
     sheet: SheetMotion
@@ -66,9 +66,10 @@ def limit_jerk(
     max_jerk: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return the mean velocity and the acceleration (n,) of the next step.
+    """Return the mean velocity and the acceleration (n,) of the next step for n coordinates.
 
-    goal_velocity: velocity (n,) to reach.
+    mean_velocity, acceleration: values (n,) of the last step.
+    goal_velocity: desired velocity (n,).
 
     The acceleration stays within its limit, and changes by at most max_jerk * step_s.
     """
@@ -143,7 +144,8 @@ def _desired_velocities(
 ) -> Floats:
     """Return the desired mean velocities (7,) of the next step within the edges' speed limit.
 
-    The elements are linear velocity (3), angular velocity (3) and stretch rate (1).
+    The first three elements are the linear velocity, the next three the angular velocity, and the
+    last element is the stretch rate.
     """
     displacement = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
@@ -183,7 +185,8 @@ def divide_edge_speed(
 ) -> tuple[float, float]:
     """Return the factors (0..1) for linear and angular speed that respect the edges' speed limit.
 
-    speeds, distances: linear and angular speed (m/s, rad/s), and remaining distances (m, rad).
+    speeds: linear and angular speed (m/s, rad/s).
+    distances: remaining distance (m) and remaining angle (rad).
 
     The speed limit is divided in proportion to the remaining distances. A part that one motion does
     not need is available to the other motion.

@@ -40,7 +40,7 @@ from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlann
 
 FIRST_HORIZON_S = 0.05
 MAX_FUTURE_S = 0.005
-"""The maximum time by which a fingertip's timestamp may lie in the future."""
+"""The maximum time (s) by which a fingertip's timestamp may be in the future."""
 
 
 def _is_finite(fingertip: Fingertip) -> bool:
@@ -53,7 +53,7 @@ def _is_finite(fingertip: Fingertip) -> bool:
 
 
 class Planner(Node):
-    """A node that publishes one sheet target per received fingertip.
+    """A node that publishes one sheet target for each fingertip message.
 
     Equal inputs result in identical messages.
     """

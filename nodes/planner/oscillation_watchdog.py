@@ -1,4 +1,4 @@
-"""Detect oscillations of finger and sheet that the sheet drives, and stop the sheet's motion."""
+"""Detect oscillations of the finger that the sheet's motion drives, and stop this motion."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ MIN_AMPLITUDE_M = 2e-4
 """The root mean square amplitude of the depth below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""The ratio of two amplitudes (second half of the window to first half) that triggers the watchdog.
-"""
+"""The ratio of two amplitudes that triggers the watchdog. It is the amplitude in the second half of
+the window divided by the amplitude in the first half."""
 
 STEADY_RATIO = 0.95
-"""The ratio of two amplitudes (second half of the window to first half) above which an oscillation
-does not decay."""
+"""The ratio of two amplitudes above which an oscillation does not decay. It is the amplitude in the
+second half of the window divided by the amplitude in the first half."""
 
 SUSTAINED_S = 1.5
 """The time after which an oscillation that does not decay triggers the watchdog."""
 
 FADE_S = 0.3
-"""The time in which the motion of the sheet's offset is reduced to zero."""
+"""The time (s) in which the watchdog reduces the motion of the sheet's offset to zero."""
 
 SLOW_S = 0.35
 """The time constant of the filter that removes slow changes of depth and offset."""
 
 
 class OscillationWatchdog:
-    """A watchdog that stops the motion of the sheet's offset if the motion drives an oscillation.
+    """A watchdog that stops changes of the sheet's offset if they drive an oscillation.
 
     The sheet transfers energy to the finger if the integral of the offset over the depth is
     positive in a cycle. A voluntary motion of the finger transfers energy to the sheet instead, and
@@ -101,9 +101,10 @@ class OscillationWatchdog:
 
 
 def _oscillates(depths: np.ndarray) -> bool:
-    """Return whether the depths (n,), m, change their sign at least twice, unlike a single push.
+    """Return whether n depths (n,), m, change their sign at least twice.
 
-    Values smaller than MIN_AMPLITUDE_M are ignored.
+    The depths of a single push change their sign less often. Values smaller than MIN_AMPLITUDE_M
+    are ignored.
     """
     large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
     return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

@@ -38,8 +38,8 @@ class PlannerParameters(NodeParameters):
         default="auto",
         description="force_curve: render the object's force over depth, by stretch and offset of "
         "the sheet; stiffness: render the object's stiffness by the stretch alone (Furukawa et al. "
-        "2007); constant_stretch: render no force; auto: the mode in the scene's methods, else "
-        "force_curve. For a rigid object, constant_stretch is always used",
+        "2007); constant_stretch: render no force; auto: the mode in the scene's methods, "
+        "otherwise force_curve. For a rigid object, constant_stretch is always used",
     )
 
     def choose_compliance(self, scene: Scene) -> ComplianceMode:
@@ -66,10 +66,10 @@ class PlannerParameters(NodeParameters):
         description="folder of cached tables of the sheet's force; null: the user's cache",
     )
     contact_on_m: float = Field(
-        default=0.0005, description="distance of finger and sheet at which contact starts, m"
+        default=0.0005, description="distance between finger and sheet at which contact starts, m"
     )
     contact_off_m: Positive = Field(
-        default=0.003, description="distance of finger and sheet at which contact ends, m"
+        default=0.003, description="distance between finger and sheet at which contact ends, m"
     )
     max_age_s: Positive = Field(default=0.1, description="maximum age of a usable fingertip, s")
     tilt_margin_rad: NonNegative = Field(

@@ -20,12 +20,12 @@ from flexsheet.nodes.models.rigid import angle_between, transform
 from flexsheet.nodes.models.shapes import Nearest, Shape
 
 MIN_STEP_RATIO = 1.0 / 512.0
-"""The resolution of the search of `limit_tilt`, as a fraction of the search distance."""
+"""The resolution of the search in `limit_tilt`, as a fraction of the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""The finer resolution of the search, which is used while the tilt is below the maximum tilt by
-more than NEAR_LIMIT_RAD. Deep inside the object, a small step can rotate the normal by many
-degrees."""
+"""The finer resolution of the search in `limit_tilt`, and the angle (rad) that defines its use. It
+is used while the tilt is below the maximum tilt by more than this angle. Deep inside the object, a
+small step can rotate the normal by many degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class SheetContact:
 
     @property
     def nearest(self) -> Nearest:
-        """Return the contact's surface point in the format of the results of `Shape.closest`."""
+        """Return the surface point of the contact in the format that `Shape.closest` returns."""
         no = np.zeros((), dtype=bool)
         return Nearest(self.point, self.normal, np.zeros(()), self.shape_operator, no, no)
 
@@ -69,8 +69,8 @@ class SheetContact:
 def transport_axes(axes: Floats, normal: Floats) -> Floats:
     """Rotate axes (3, 3) by the smallest rotation that maps the third axis to `normal` (3,).
 
-    The rotation is the parallel transport along the shorter arc between both normals. The result is
-    undefined for opposite normals. Rounding errors do not accumulate.
+    The rotation is the parallel transport along the shorter arc between both normals. If the
+    normals are opposite, the result is undefined. Rounding errors do not accumulate.
     """
     both = axes[:, 2] + normal
     # The rotation is the product of two Householder reflections.  The first reflection
@@ -107,7 +107,7 @@ def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
 def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> SheetContact:
     """Return the contact of a sheet that waits at a surface point for an approaching finger.
 
-    home: axes (3, 3) of the sheet before they are rotated to the normal.
+    home: axes (3, 3) of the sheet before they are rotated to the surface normal.
     half_width_m: maximum distance of the contact from the sheet's centre.
 
     The contact is on the sheet's horizontal centre line. Within the maximum distance, the sheet's
@@ -124,7 +124,7 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     rate: velocity (3,) m/s of the contact on the object.
 
     The twist consists of linear velocity (m/s) and angular velocity (rad/s). The angular velocity
-    is n x dn/dt with the normal n. The sheet's point in contact is at rest.
+    is n x dn/dt with the surface normal n. The point of the sheet in contact is at rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)
@@ -136,13 +136,13 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
 def compute_tangent_twist(
     contact: SheetContact, rate: Floats, home: Floats, half_width_m: float
 ) -> Floats:
-    """Return the twist (6,) of a waiting sheet while its surface point moves.
+    """Return the twist (6,) of a sheet that waits at a surface point while this point moves.
 
     rate: velocity (3,) m/s of the surface point.
     home, half_width_m: see `make_tangent_contact`.
 
-    With the normal n and the third axis h of `home`, the angular velocity of the sheet is n x dn/dt
-    plus -(h x n) . dn/dt / (1 + h . n) about the normal.
+    With the surface normal n and the third axis h of `home`, the angular velocity of the sheet is n
+    x dn/dt plus -(h x n) . dn/dt / (1 + h . n) about the normal.
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
     tangential = rate - normal * (rate @ normal)
@@ -170,7 +170,8 @@ def cross(a: Floats, b: Floats) -> Floats:
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
     """Return the angle (rad) by which `axes` (3, 3) are rotated about their normal.
 
-    home: axes (3, 3) with the angle 0, after the smallest rotation that makes both normals equal.
+    home: axes (3, 3) that define the angle 0. The smallest rotation that makes both normals equal
+        is applied to them first.
     """
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
@@ -179,14 +180,12 @@ def measure_spin_rad(axes: Floats, home: Floats) -> float:
 def limit_tilt(
     shape: Shape, start: Nearest, found: Nearest, front: Floats, max_tilt_rad: float
 ) -> tuple[Nearest, bool]:
-    """Return the last surface point within the maximum tilt between `start` and `found`.
-
-    The second result is whether this point differs from `found`.
+    """Return the last surface point between `start` and `found` within the maximum tilt.
 
     front: unit vector (3,) from which the tilt is measured.
 
-    The search follows the straight line to `found` in increasing steps, and projects each step onto
-    the surface.
+    The second result is whether the returned point differs from `found`. The search follows the
+    straight line to `found` in increasing steps, and projects each step onto the surface.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
     if found.normal @ front >= limit:

@@ -14,8 +14,8 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPush
 
 MAX_STIFFNESS_RATIO = 0.05
-"""The maximum relative difference of the stiffness, which equals three standard deviations of a
-calibration."""
+"""The maximum relative difference between the stiffness in the scene and the calibrated stiffness.
+It equals three standard deviations of a calibrated stiffness."""
 
 
 def check_stiffness(
@@ -49,10 +49,11 @@ MAX_FORCE_RATIO = 0.12
 the sheet model 3 %. A depth error of 0.3 mm contributes 3 to 6 %, and the gauge 1 %."""
 
 MIN_INDENTATION_M = 0.005
-"""The minimum push depth for a comparison. The relative errors at smaller depths are too large."""
+"""The minimum indentation (m) for a comparison of forces. The relative errors at smaller depths are
+too large."""
 
 MIN_FORCE_N = 0.2
-"""The minimum force for a comparison. The relative errors of smaller forces are too large."""
+"""The minimum force (N) for a comparison. The relative errors of smaller forces are too large."""
 
 QUIET_S, QUIET_M = 0.15, 0.0005
 """The criterion for a push at rest: within QUIET_S before and after the measurement, the

@@ -76,9 +76,9 @@ def compute_membrane_table(
     finger_radius_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
-    """Compute a table of the sheet's force by finite elements of the membrane.
+    """Compute a table of the sheet's force by the finite element method for membranes.
 
-    stretches: stretch ratios (n,).
+    stretches: n stretch ratios (n,).
     xs_m, ys_m: coordinates of the pushes on the sheet.
     progress: function that receives the number of finished pushes and the total number of pushes.
     """
@@ -114,7 +114,8 @@ BENCHMARK_POSITIONS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.25, 0.0),
     ("near the free edge", 0.0, 0.36),
 )
-"""The benchmarked positions: name, x as a fraction of the width, y as a fraction of the height."""
+"""The benchmarked positions: name, x as a fraction of the width, and y as a fraction of the height.
+"""
 
 
 MakeTable = Callable[[Scene], TabulatedSheetModel]

@@ -5,25 +5,25 @@ from __future__ import annotations
 from flexsheet.messages.types import Side
 
 RESTART_COUNT = 3
-"""The number of consecutive late fingertips that indicate that a clock was set back."""
+"""The number of consecutive late fingertip messages that indicate that a clock was set back."""
 
 MIN_STEP_NS = 1_000_000
-"""The minimum plausible interval between two exposures. No camera is faster."""
+"""The minimum plausible interval (ns) between two exposures. No camera has a higher frame rate."""
 
 AGE_WEIGHT = 0.05
-"""The weight of the newest value in the exponential average of the age of fingertips. At 60 Hz, the
-time constant is 0.33 s."""
+"""The weight of the newest value in the exponential average of the age of fingertips. At 60
+fingertips per second, the time constant is 0.33 s."""
 
 DELAY_WEIGHT = 0.11
-"""The weight of the newest value in the exponential average of an arm's latency. At 5 Hz, the time
-constant is 1.7 s."""
+"""The weight of the newest value in the exponential average of an arm's latency. At 5 values per
+second, the time constant is 1.7 s."""
 
 
 class MonotonicTimestampFilter:
     """A filter that drops each fingertip whose timestamp is before the last accepted timestamp.
 
-    After `RESTART_COUNT` consecutive late fingertips, the filter restarts, because the clock was
-    then set back.
+    `RESTART_COUNT` consecutive late fingertips indicate that the clock was set back. The filter
+    then restarts.
     """
 
     def __init__(self) -> None:
@@ -31,10 +31,12 @@ class MonotonicTimestampFilter:
         self._late_ns: list[int] = []
 
     def update(self, source_ns: int, first_step_s: float) -> float | None:
-        """Return the time (s) since the last accepted fingertip, or None for a dropped fingertip.
+        """Return the time (s) since the last accepted fingertip, or None if it is too late.
 
         source_ns: time of the exposure.
         first_step_s: result for the first fingertip and after a restart.
+
+        If the result is None, the new fingertip must be dropped.
         """
         last_ns = self._last_ns
         if last_ns is not None and source_ns < last_ns + MIN_STEP_NS:
@@ -50,8 +52,9 @@ class MonotonicTimestampFilter:
 class ActuationDelayEstimator:
     """An estimator of the time from the publication of a fingertip to the arms' motion.
 
-    The delay is the latency that the arms report, minus the mean age of fingertips at publication.
-    delay_s: mean delay over both arms, or the initial value before any report.
+    delay_s: mean delay of both arms, or the initial value before any report.
+
+    The delay is the latency that an arm reports, minus the mean age of fingertips at publication.
     """
 
     def __init__(self, initial_s: float, max_s: float) -> None:

@@ -26,8 +26,8 @@ from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 
 EDGE_SPEED_FRACTION = 0.7
-"""The fraction of the maximum tool speed that the planner uses. A late arm needs the rest to catch
-up."""
+"""The fraction of the maximum tool speed that the planner uses. The rest is reserved for an arm
+that is late and must catch up."""
 
 EDGE_MARGIN_M = 0.03
 """The minimum distance of a contact from a clamp, so the finger cannot touch the clamp."""
@@ -41,8 +41,8 @@ MAX_STEP_S = 0.1
 stopped."""
 
 KEEP_S = 0.15
-"""The time for which a trajectory continues with constant velocity. A lost packet is repeated
-within 0.1 to 0.15 s."""
+"""The time (s) for which a trajectory continues with constant velocity. If a packet is lost, it is
+repeated within 0.1 to 0.15 s."""
 
 MIN_BRAKE_S, MAX_BRAKE_S = 0.1, 0.2
 """The minimum and maximum duration of the deceleration at the end of a trajectory."""
@@ -115,9 +115,9 @@ class SheetTrajectoryPlanner:
     ) -> PlannedStep:
         """Move the sheet for `step_s` towards the contact with a finger.
 
-        position_world, velocity_world: predicted position and velocity (3,) of the finger, m and
-            m/s.
-        measured_world: measured position (3,) of the finger, m; None if equal to position_world.
+        position_world, velocity_world: predicted position (m) and velocity (m/s) of the finger,
+            each (3,).
+        measured_world: measured position (3,) of the finger, m; None if it equals `position_world`.
         """
         finger = apply(self._object_from_world, position_world)
         velocity = self._object_from_world[:3, :3] @ velocity_world
@@ -194,7 +194,7 @@ class SheetTrajectoryPlanner:
 
     @property
     def in_contact(self) -> bool:
-        """Return whether the last valid finger position was in contact."""
+        """Return whether the finger touched the sheet at the last valid finger position."""
         return self._command.phase in ("contact", "hold")
 
     def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:
@@ -240,7 +240,7 @@ class SheetTrajectoryPlanner:
 
 
 def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajectory | None:
-    """Return the trajectory of the sheet to rest, or None if the sheet cannot stop in time."""
+    """Return the trajectory that stops the sheet, or None if the sheet cannot stop in time."""
     brake_s = max(
         MIN_BRAKE_S,
         measure_length(motion.twist_world[:3]) / bounds.acceleration_m_per_s2,

@@ -23,19 +23,19 @@ from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 RETRY_NS = 5_000_000_000
-"""The time from a disk error to the next attempt to start a bag."""
+"""The time (ns) from a disk error to the next attempt to start a bag."""
 
 
 class BagRecording:
     """A recorder that writes messages to bags while recording is requested.
 
-    A bag is closed when the free disk space falls to `keep_free_bytes`. The remaining space
-    suffices for the index of the bag. When twice as much space is free again, a new bag starts with
-    the last messages of all latched topics. Disk errors during writing are passed to `on_error` and
-    not raised.
-
     note: state of the recording, as one line of text.
     lost: number of messages that were lost since the last bag.
+
+    A bag is closed when the free disk space falls to `keep_free_bytes`. The remaining space is
+    sufficient for the index of the bag. When twice as much space is free again, a new bag starts
+    with the last messages of all latched topics. Disk errors during writing are passed to
+    `on_error` and not raised.
     """
 
     def __init__(
@@ -72,13 +72,14 @@ class BagRecording:
             self._path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise BagError(
-                f"{self._path.parent}: the folder cannot be created: {error.strerror}"
+                f"{self._path.parent}: the folder cannot be created: {error.strerror}; "
+                "correct the path of the bag, or the permissions"
             ) from error
         self._start_bag()
         self.check_disk()
 
     def set_requested(self, requested: bool) -> None:
-        """Start a bag if recording is requested, otherwise end the current bag.
+        """Start a bag if recording is requested; otherwise end the current bag.
 
         Disk errors are passed to `on_error`.
         """

@@ -17,7 +17,7 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 
 class Recorder(Node):
-    """A node that writes the messages it receives to a bag.
+    """A node that writes the messages that it receives to a bag.
 
     An existing bag is never overwritten. If the disk is full, the graph continues without a
     recording. Lost messages are counted as dropped, and the node's status note contains the reason.
