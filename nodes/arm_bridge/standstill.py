@@ -21,8 +21,7 @@ encoder noise."""
 
 MAX_RESTART_SHIFT_M = 0.005
 """The maximum distance (m) between the commanded and the measured edge at which a motion may
-restart. If the servo lag is at least 15 ms, an edge lags by this distance at a speed below 0.25
-m/s."""
+restart. An edge that moves at 0.25 m/s with a servo lag of 20 ms lags by this distance."""
 
 JUMP_MARGIN_RAD = 0.002
 """The tolerance (rad) of the plausible joint motion between two measurements."""

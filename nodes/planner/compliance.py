@@ -103,7 +103,6 @@ class ObjectCurve:
     _curve: scipy.interpolate.PchipInterpolator = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-
         depths, forces = self.depths_m, self.forces_n
         if depths.ndim != 1 or len(depths) < 2 or depths.shape != forces.shape:
             raise UnfitCurveError(
