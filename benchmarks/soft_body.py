@@ -46,14 +46,14 @@ from flexsheet.nodes.fem_solver.table import TableSoftBody
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 DEMO_SPACING_M = 0.0045
-JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
+REFERENCE_POSITIONS = ((0.004, 0.1), (0.021, 0.55))
 """The positions along the axis (m) and angles (rad) of points that are no samples of a table."""
-JUDGED_M = (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.004, 0.005, 0.007, 0.010)
+REFERENCE_DEPTHS_M = (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.004, 0.005, 0.007, 0.010)
 """The depths at which forces are compared with those of the independent solver."""
 RANDOM_POINTS, RANDOM_WITHIN_M = 300, (0.03, 0.025)
 """The number of random points, and their maximum distances from the front along and around the
 axis."""
-JUDGE_RATIO = 0.3
+REFERENCE_SPACING_RATIO = 0.3
 """The spacing of the reference mesh at the push in finger radii, finer than that of the table."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
@@ -105,7 +105,7 @@ def evaluate_table(scene: Scene, spacing_m: float, *, cold: bool) -> dict[str, A
     )
     mesh, radius_m = build_mesh(best.spec.mesh), require_cylinder(scene).radius_m
     report["pushes"] = []
-    for along, angle in JUDGED_AT:
+    for along, angle in REFERENCE_POSITIONS:
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])
         sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
         report["pushes"] += evaluate_push(scene, mesh, sample, best, linear)
@@ -159,7 +159,7 @@ def find_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> lis
         [
             [
                 force.force_n if curve and (force := curve.force(depth)) else np.nan
-                for depth in JUDGED_M
+                for depth in REFERENCE_DEPTHS_M
             ]
             for curve in curves
         ]
@@ -181,7 +181,7 @@ def find_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> lis
         rows += [
             {"method": name, "depth_mm": round(1e3 * depth, 3)}
             | {label: 100.0 * float(values[at]) for label, values in ratios.items()}
-            for at, depth in enumerate(JUDGED_M)
+            for at, depth in enumerate(REFERENCE_DEPTHS_M)
         ]
     return rows
 
@@ -195,7 +195,7 @@ def normal_forces(
     for along, around in points:
         normal = np.array([0.0, np.sin(around / radius_m), np.cos(around / radius_m)])
         point = radius_m * normal + np.array([along, 0.0, 0.0])
-        queries = [ContactQuery(point, normal, depth) for depth in JUDGED_M]
+        queries = [ContactQuery(point, normal, depth) for depth in REFERENCE_DEPTHS_M]
         forces.append([float(one.method.respond(query).force_n @ normal) for query in queries])
     return np.array(forces)
 
@@ -219,7 +219,7 @@ def evaluate_push(
         sample,
         poisson_ratio=best.spec.poisson_ratio,
         finger_radius_m=scene.finger.radius_m,
-        spacing_m=JUDGE_RATIO * scene.finger.radius_m,
+        spacing_m=REFERENCE_SPACING_RATIO * scene.finger.radius_m,
     )
     solved = snapshots.solve_snapshot(job)
     nodes, weights = SurfaceLocator(solved.rest, solved.faces).weights(best.rest)

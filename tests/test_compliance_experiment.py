@@ -110,7 +110,7 @@ def test_errors_of_what_cannot_be_felt_count_as_of_the_least_felt() -> None:
     assert light.error_ratio == pytest.approx(0.5)
 
 
-def test_the_felt_force_is_judged_by_the_independent_reference() -> None:
+def test_the_felt_force_is_compared_with_the_independent_reference() -> None:
     sample = ForceSample(0.01, 1.25, 1.1, 0.0, "linear", ReferenceForce(1.0, 0.01))
     assert sample.error_ratio == pytest.approx(0.1)
     assert sample.model_error_ratio == pytest.approx(0.25)

@@ -31,7 +31,7 @@ async def test_a_stroke_is_presented_over_the_real_time_control() -> None:
             assert server.controller.error == ""
             assert server.controller.refused == 0
         distances, angles = presented_errors(rig, path, begin_ns)
-        # Half of the time at least the machine did not pause; what is judged is the arms.
+        # Half of the time at least the machine did not pause; only the arms are checked.
         assert np.median(distances) < 0.001
         assert np.degrees(np.median(angles)) < 0.75
         stretches = np.array([sample.edge_distance_m for sample in rig.samples])

@@ -260,13 +260,13 @@ TURNED_PER_S = 0.8
 
 
 def normal_errors_deg(
-    desk: PlannerHarness, judge: Shape, start: Floats, heading: Floats, length_m: float
+    desk: PlannerHarness, reference: Shape, start: Floats, heading: Floats, length_m: float
 ) -> Floats:
     """Return the errors of the sheet's normal along a stroke at a speed for its tightest bend,
     degrees."""
-    _, _, bends = walk(judge, start, heading, 5e-4, int(length_m / 5e-4))
+    _, _, bends = walk(reference, start, heading, 5e-4, int(length_m / 5e-4))
     step_m = min(0.03, TURNED_PER_S / bends.max()) * STEP_S
-    points, normals, _ = walk(judge, start, heading, step_m, int(length_m / step_m))
+    points, normals, _ = walk(reference, start, heading, step_m, int(length_m / step_m))
     touch(desk, points[0], normals[0])
     # A hand starts and stops gently.
     share = eased_path([np.zeros(1), np.full(1, len(points) - 1.0)], 2 * len(points))[:, 0]
@@ -275,7 +275,7 @@ def normal_errors_deg(
     )
     sent = desk.follow(fingers)
     assert set(phases(sent)) == {"contact"}, reasons(sent)
-    wanted = judge.closest(
+    wanted = reference.closest(
         fingers, previous=fingers + 0.001 * np.repeat(normals[:1], len(fingers), 0)
     )
     return np.degrees(

@@ -56,10 +56,10 @@ def test_only_two_passes_onto_the_deformed_shape_are_correct_for_it(points: list
     assert error(points, "two_pass", 0, 25) < 0.1
 
 
-def test_the_floor_corrects_nothing_and_is_no_choice(points: list[Point]) -> None:
-    assert error(points, "floor", 0, 25) == pytest.approx(error(points, "none", 0, 25))
-    assert "floor" not in pareto_front(points)
-    assert not is_in_range("floor", tilt_deg=0, push_mm=0)
+def test_the_lower_bound_corrects_nothing_and_is_no_choice(points: list[Point]) -> None:
+    assert error(points, "lower_bound", 0, 25) == pytest.approx(error(points, "none", 0, 25))
+    assert "lower_bound" not in pareto_front(points)
+    assert not is_in_range("lower_bound", tilt_deg=0, push_mm=0)
 
 
 def test_a_projector_of_other_pixels_lights_the_same_point() -> None:

@@ -288,7 +288,7 @@ class Choice:
             "error": self.chosen.error,
             "spare_ratio": self.spare_ratio,
             "sentence": self.explain(),
-            "judged": [asdict(replace(one, points=())) for one in self.evaluations],
+            "evaluations": [asdict(replace(one, points=())) for one in self.evaluations],
         }
 
 

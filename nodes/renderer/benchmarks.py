@@ -1,10 +1,9 @@
 """Measure the time and the image error of the methods that correct the projected image.
 
 The measured time is the time for drawing a stereo frame, without reading its pixels. The method
-`floor` gives a lower bound of this time. This method clears the frame and draws the same triangles
-once for each eye, with the same number of samples. The error is measured at each point that the eye
-sees on a reference sheet. The caller provides this reference, computed independently of the
-renderer.
+`lower_bound` has the minimum of this time: it clears the frame and draws the same triangles once
+for each eye, with the same number of samples. The error is measured at each point that the eye sees
+on a reference sheet. The caller provides this reference, computed independently of the renderer.
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure
 sheet's left and right edges, and the fingertip (3,), m, or None."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
-FLOOR, TWO_PASS_TRIANGLES = "floor", "two_pass_triangles"
+LOWER_BOUND, TWO_PASS_TRIANGLES = "lower_bound", "two_pass_triangles"
 """The names of two benchmark methods: the lower bound of the time, and the method two_pass for a
 sheet of four triangles.
 """
 CORRECTION_OF: dict[str, Correction] = {
-    FLOOR: "none",
+    LOWER_BOUND: "none",
     **{correction: correction for correction in CORRECTIONS},
     TWO_PASS_TRIANGLES: "two_pass",
 }
@@ -88,7 +87,7 @@ def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     if method == "none":
         return tilt_deg == 0 and push_mm == 0
     deepest_mm = {
-        FLOOR: -1.0,
+        LOWER_BOUND: -1.0,
         "four_triangles": max_triangles_mm,
         TWO_PASS_TRIANGLES: max_triangles_mm,
         "two_pass": 60.0,
@@ -198,10 +197,10 @@ def _make_situation(
 
 
 def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """Draw one stereo frame by a correction method, or by `FLOOR`, the lower bound of the time."""
+    """Draw one stereo frame by a correction method, or by the method `LOWER_BOUND`."""
     display = Display(correction=CORRECTION_OF[method], stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
-    if method == FLOOR:
+    if method == LOWER_BOUND:
         for eye in scene_renderer.eyes(display):
             scene_renderer.canvas.draw_unresolved(scene_renderer.view(eye), look)
     else:

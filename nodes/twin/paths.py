@@ -302,10 +302,10 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
     times_s, points = recorded[:, 0] - recorded[0, 0], recorded[:, 1:] * 1e-3
     points = points - np.median(points, axis=0)
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
-    room = np.array([*touchable(scene), 0.05])
-    points *= min(1.0, float((room / np.maximum(high - low, 1e-9)).min()))
+    extent = np.array([*touchable(scene), 0.05])
+    points *= min(1.0, float((extent / np.maximum(high - low, 1e-9)).min()))
 
-    half = 0.5 * room
+    half = 0.5 * extent
     press_m = scene.working_range.push_depth_m * PRESS_FRACTION
     touch = np.quantile(points[:, 2], 0.3)
     places = np.stack(

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-FLOORS = ("messages", "nodes", "launch")
-SHARED_ROOMS = {
+LAYERS = ("messages", "nodes", "launch")
+SHARED_MODULES = {
     "flexsheet.nodes",
     "flexsheet.nodes.arrays",
     "flexsheet.nodes.background",
@@ -26,8 +26,8 @@ SHARED_ROOMS = {
 TWIN_MAY_SHARE = {"flexsheet.nodes.models.rigid", "flexsheet.nodes.models.shapes"}
 
 
-def modules(floor: str) -> Iterator[Path]:
-    return (ROOT / floor).rglob("*.py")
+def modules(layer: str) -> Iterator[Path]:
+    return (ROOT / layer).rglob("*.py")
 
 
 @cache
@@ -43,18 +43,18 @@ def imports_of(path: Path) -> set[str]:
     return names
 
 
-def floor_of(name: str) -> str:
+def layer_of(name: str) -> str:
     """Return the top-level package of a module of the project; otherwise the first part of the
     name.
     """
     return name.removeprefix("flexsheet.").split(".", maxsplit=1)[0]
 
 
-@pytest.mark.parametrize("floor", FLOORS)
-def test_imports_go_down_only(floor: str) -> None:
-    above = FLOORS[FLOORS.index(floor) + 1 :]
-    for path in modules(floor):
-        upward = {name for name in imports_of(path) if floor_of(name) in above}
+@pytest.mark.parametrize("layer", LAYERS)
+def test_imports_go_down_only(layer: str) -> None:
+    above = LAYERS[LAYERS.index(layer) + 1 :]
+    for path in modules(layer):
+        upward = {name for name in imports_of(path) if layer_of(name) in above}
         assert not upward, f"{path.relative_to(ROOT)} imports {upward}"
 
 
@@ -71,7 +71,7 @@ def test_no_node_imports_another_node() -> None:
             and name not in ("flexsheet.nodes.NodeRole", "flexsheet.nodes.OmissionReason")
             and not any(
                 name == room or name.startswith(f"{room}.")
-                for room in {own, *SHARED_ROOMS} - {"flexsheet.nodes"}
+                for room in {own, *SHARED_MODULES} - {"flexsheet.nodes"}
             )
         }
         assert not foreign, f"{path.relative_to(ROOT)} imports {foreign}"
@@ -85,7 +85,7 @@ def test_models_know_neither_messages_nor_sockets_nor_files() -> None:
             for name in imports_of(path)
             if not name.startswith("flexsheet.messages.errors")  # the base class of errors
         }
-        found = {floor_of(name) for name in names} & forbidden
+        found = {layer_of(name) for name in names} & forbidden
         assert not found, f"{path.relative_to(ROOT)} imports {found}"
 
 
@@ -102,8 +102,8 @@ def test_the_simulator_shares_nothing_with_the_code_it_evaluates() -> None:
 
 def test_no_unfinished_marks() -> None:
     marks = ("TO" + "DO", "FIX" + "ME", "XX" + "X", "HA" + "CK")
-    for floor in (*FLOORS, "tests", "benchmarks"):
-        for path in modules(floor):
+    for layer in (*LAYERS, "tests", "benchmarks"):
+        for path in modules(layer):
             words = path.read_text().replace("(", " ").replace(":", " ").split()
             found = [mark for mark in marks if mark in words]
             assert not found, f"{path.relative_to(ROOT)}: {found}"
