@@ -208,7 +208,9 @@ class PlacedArm:
     def solve_joints(self, world_from_edge: Floats, guess_rad: Floats) -> Floats:
         """Return the joint angles (6,), rad, for a pose (4, 4) of the edge.
 
-        guess_rad: initial joint angles (6,). Raises ValueError if the pose is out of reach.
+        guess_rad: initial joint angles (6,).
+
+        Raises ValueError if the pose is out of reach.
         """
         flange = inverse(self.world_from_base) @ world_from_edge @ inverse(self.flange_from_edge)
         return self.mechanics.solve_inverse_kinematics(flange, guess_rad)
@@ -254,8 +256,8 @@ class Servo:
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
         """Simulate the servos for `duration_s`, in steps of at most a millisecond.
 
-        wanted_rad: set-point (6,), rad. braking: whether to brake along the path instead of
-        following the set-point.
+        wanted_rad: set-point (6,), rad.
+        braking: whether to brake along the path instead of following the set-point.
         """
         if braking and not self.velocity_rad_per_s.any():
             return

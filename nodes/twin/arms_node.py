@@ -81,7 +81,7 @@ class TwinArmsParameters(SimulatorParameters):
 def open_joints_file(path: str | None) -> dict[str, Floats]:
     """Map a file that stores the joint angles (rad) of both arms to arrays.
 
-    Return one array (6,) per side. The arrays contain NaN if the file is new or `path` is None.
+    Returns one array (6,) per side. The arrays contain NaN if the file is new or `path` is None.
     Raises OSError if the file cannot be opened.
     """
     if path is None:
@@ -99,7 +99,8 @@ def joint_torques_nm(
 ) -> Floats:
     """Return the joint torques (6,), N m, that a force on the sheet's edge causes in an arm.
 
-    joints_rad: joint angles (6,). flange_from_edge: pose (4, 4) of the edge in the flange frame.
+    joints_rad: joint angles (6,).
+    flange_from_edge: pose (4, 4) of the edge in the flange frame.
     force_n: force (3,) in the base frame.
     """
     step_rad = 1e-4

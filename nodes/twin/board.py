@@ -55,8 +55,10 @@ class BoardError(FlexsheetError, ValueError):
 class Light:
     """The uneven illumination of an image, and the background behind the board.
 
-    gain: brightness factor at the image centre. slope_x, slope_y: relative change of the brightness
-    from the centre to the right and lower edges. background: grey levels (height, width).
+    gain: brightness factor at the image centre.
+    slope_x, slope_y: relative change of the brightness from the centre to the right and lower
+        edges.
+    background: grey levels (height, width).
     """
 
     gain: float
@@ -68,7 +70,8 @@ class Light:
 class TwinBoard:
     """A simulated stereo camera that views a calibration board.
 
-    camera: true lenses and poses. seed: determines noise, illumination and poses.
+    camera: true lenses and poses.
+    seed: determines noise, illumination and poses.
     """
 
     def __init__(self, camera: StereoCamera, board: Board, *, seed: int) -> None:
@@ -354,8 +357,8 @@ def _markers(board: Board) -> NDArray[np.bool_]:
 def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
     """Return an array (...) that is 1 where a marker is black and 0 elsewhere.
 
-    squares: board positions (..., 2) in units of squares. share: side length of a marker as a
-    fraction of its square.
+    squares: board positions (..., 2) in units of squares.
+    share: side length of a marker as a fraction of its square.
     """
     rows, columns, cells, _ = markers.shape
     column = np.clip(np.floor(squares[..., 0]).astype(np.intp), 0, columns - 1)

@@ -111,8 +111,8 @@ class Occluder:
 class Sheet:
     """An illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
 
-    contrast: standard deviation of the texture's grey levels. grain_m: size of the texture's
-    features.
+    contrast: standard deviation of the texture's grey levels.
+    grain_m: size of the texture's features.
     """
 
     half_width_m: float = 0.12
@@ -156,7 +156,8 @@ def covered(share: float, *, views: Views = "both") -> Clutter:
     """Return clutter that consists of an occluder with a straight edge across the marker.
 
     share: hidden fraction (0 to 1) of the marker, from the side +x. With 1, the blurred edge of the
-    marker is also hidden. views: cameras in which the marker is hidden.
+        marker is also hidden.
+    views: cameras in which the marker is hidden.
     """
     radius_m = 0.05
     if share >= 1.0:

@@ -148,7 +148,8 @@ class TrueProjector:
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """Compute the rays of a projector that illuminates a sheet.
 
-        vertices (v, 3): vertices of the sheet, world frame, m. triangles (t, 3): vertex indices.
+        vertices (v, 3): vertices of the sheet, world frame, m.
+        triangles (t, 3): vertex indices.
         """
         self._world_from_projector = pose_matrix(projector.world_from_projector)
         self._lens = lens = projector.lens
@@ -258,7 +259,8 @@ def seen(
 ) -> Image:
     """Render the image (rows, columns, 3) that a camera at the eye takes of the sheet.
 
-    projected: projected image (height, width, 3). eye (3,): position, m.
+    projected: projected image (height, width, 3).
+    eye (3,): position, m.
 
     A pixel is black if its rays miss the sheet, or if a fold of the sheet blocks the light.
     """
@@ -290,7 +292,7 @@ def seen(
 def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | None:
     """Return the part of the eye's image that shows world points (n, 3), with a margin.
 
-    Return None if the image shows none of the points.
+    Returns None if the image shows none of the points.
     """
     if len(points) == 0:
         return None

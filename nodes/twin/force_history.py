@@ -66,7 +66,7 @@ class ForceHistory:
         """Make the force history for the sheet of an apparatus (the true parameters of the
         hardware).
 
-        Return None if the sheet has neither hysteresis nor creep.
+        Returns None if the sheet has neither hysteresis nor creep.
         """
         if apparatus is None:
             return None

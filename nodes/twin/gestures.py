@@ -187,7 +187,8 @@ def _taps(
     In a tap, the finger moves from `lift_m` above the surface to PRESS_M below the surface, rests,
     and moves back. It does not brake before contact.
 
-    every_s: mean time between taps. contact_s: time below the surface in each tap.
+    every_s: mean time between taps.
+    contact_s: time below the surface in each tap.
     """
     generator = np.random.default_rng(seed)
     grid = np.linspace(0.0, 1.0, 1001)
@@ -276,7 +277,8 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 def _rounds(turns: int, turn_s: float) -> Sampled:
     """Sample the angle (n,), rad, of a rotation that starts and ends at rest.
 
-    turns: number of revolutions. turn_s: duration of one revolution.
+    turns: number of revolutions.
+    turn_s: duration of one revolution.
     """
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s

@@ -69,7 +69,7 @@ class HandImpedance:
     def of(cls, apparatus: Apparatus | None) -> Self:
         """Return the hand impedance from an apparatus (true parameters of the simulated hardware).
 
-        Return the default values if the apparatus contains no impedance.
+        Returns the default values if the apparatus contains no impedance.
         """
         finger = None if apparatus is None else apparatus.finger
         if finger is None or finger.hand_mass_kg is None:
@@ -99,8 +99,8 @@ class HandImpedance:
 class Touch:
     """The local state of the sheet below the finger at one time.
 
-    origin (3,): point of the unloaded sheet's tangent plane, m. normal (3,): its unit normal
-        towards the user.
+    origin (3,): point of the unloaded sheet's tangent plane, m.
+    normal (3,): its unit normal towards the user.
     curve_n (d,): normal forces at the depths in the force table `SheetReaction`.
     """
 
@@ -120,7 +120,8 @@ class TrueSheet:
     def find_touch(self, edges: tuple[Floats, Floats], tip: Floats) -> Touch:
         """Return the sheet's tangent plane and force curve at the point nearest to the fingertip.
 
-        edges: poses (4, 4) of the left and right edges. tip: world position (3,), m.
+        edges: poses (4, 4) of the left and right edges.
+        tip: world position (3,), m.
         """
         left, right = edges
         distance_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))

@@ -74,8 +74,8 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 class TrueRubber:
     """The dimensions and material of the simulated sheet at rest.
 
-    width_m: free length of the unstretched sheet between the clamps. height_m: length along the
-        clamps.
+    width_m: free length of the unstretched sheet between the clamps.
+    height_m: length along the clamps.
     density_kg_per_m3: density of the rubber; 0 if the weight is neglected.
     thickness_gradient: relative change of the thickness from the left to the right clamp, and from
         the lower to the upper end of the clamps.
@@ -304,7 +304,8 @@ def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
 def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION) -> Floats:
     """Return the elastic energy (...,) per volume at rest, J/m3, of a membrane that wrinkles.
 
-    c: components [C11, C22, C12] (..., 3) of the right Cauchy-Green tensor. shear_modulus: in Pa.
+    c: components [C11, C22, C12] (..., 3) of the right Cauchy-Green tensor.
+    shear_modulus: in Pa.
     """
     large, small, _ = _eigen(c)
     stretched = np.maximum(large, 1.0)
@@ -416,7 +417,7 @@ class _Finger:
     def release(self, positions: Floats, fraction: float) -> bool:
         """Let the nodes slip whose friction force exceeds the Coulomb limit.
 
-        Return whether forces changed; then a new equilibrium must be computed. The friction force
+        Returns whether forces changed; then a new equilibrium must be computed. The friction force
         of a slipping node is the friction coefficient times the normal force. Its direction does
         not change.
 
@@ -483,7 +484,7 @@ def solve_path(
 ) -> list[DeformedSheet]:
     """Compute the equilibria of the sheet while a fingertip advances through the given positions.
 
-    Return the sheet at each position, or only the untouched sheet if there are no positions.
+    Returns the sheet at each position, or only the untouched sheet if there are no positions.
 
     world_from_left_edge, world_from_right_edge: poses (4, 4) of the clamped edges. The origin is
         the centre of the edge, and y points along the edge.
@@ -608,7 +609,7 @@ def _cone(mesh: _Mesh, focus_m: tuple[float, float], rubber: TrueRubber) -> Floa
 def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, int]:
     """Minimise the energy of the sheet by Newton's method with a line search.
 
-    Return the node positions (nodes, 3), m, and the number of steps. Raises NotConvergedError if
+    Returns the node positions (nodes, 3), m, and the number of steps. Raises NotConvergedError if
     the residual force exceeds the tolerance.
     """
     positions = start.copy()

@@ -85,8 +85,8 @@ class MxtController:
     - a jump of the set-point
     - no packet for `timeout_s`
 
-    servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joint
-        angles.
+    servo_lag_s, backlash_rad: see `Servo`.
+    noise_rad: standard deviation of the measured joint angles.
     filter_s: time constant of the low-pass filter on set-points.
     load_nm (6,): joint torques that the sheet's tension causes. The simulator sets them.
     restart_after_s: time after which the program restarts automatically.

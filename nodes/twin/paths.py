@@ -178,8 +178,8 @@ def _lean_rad(found: Nearest, towards_user: Floats) -> float:
 def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
     """Return points and normals (k, n, 3) on the geodesics through points (n, 3).
 
-    starts, headings (n, 3): points and directions of the geodesics at these points. ticks (k,):
-    ascending distances (m) at which points are computed. The middle element is 0.
+    starts, headings (n, 3): points and directions of the geodesics at these points.
+    ticks (k,): ascending distances (m) at which points are computed. The middle element is 0.
     """
     centre = len(ticks) // 2
     begun = shape.closest(starts)

@@ -127,8 +127,9 @@ class Sensor:
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
         """Return a copy of the sensor that blurs points at the depth `depth_m` by defocus.
 
-        defocus_px: standard deviation of the blur by the defocus alone. Raises ValueError if even a
-            focus at infinity gives less blur.
+        defocus_px: standard deviation of the blur by the defocus alone.
+
+        Raises ValueError if even a focus at infinity gives less blur.
         """
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
@@ -180,7 +181,7 @@ class CameraView:
     def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
         """Return the bounding box of pixels, enlarged by `reach_px` on each side, within the image.
 
-        Return None if the bounding box is outside the image.
+        Returns None if the bounding box is outside the image.
         """
         height, width = self.canvas.shape
         rows = slice(
@@ -345,8 +346,8 @@ class TwinCamera:
     ) -> list[Window]:
         """Draw the finger and all moving objects on the camera's canvas; return the drawn windows.
 
-        tips (n, 3): fingertip positions during the exposure, m. times_s (n,): times of these
-        positions.
+        tips (n, 3): fingertip positions during the exposure, m.
+        times_s (n,): times of these positions.
         """
         clutter, sensor = self.clutter, self.sensor
         time_s, tip = float(times_s.mean()), tips.mean(axis=0)
@@ -404,7 +405,7 @@ class TwinCamera:
     ) -> Window | None:
         """Draw a tapered capsule between two world points (2, 3), and return the drawn window.
 
-        Return None if the capsule is not visible.
+        Returns None if the capsule is not visible.
 
         lit: whether the lamp illuminates the capsule from the side; otherwise its grey level is
             constant.
@@ -457,7 +458,7 @@ class TwinCamera:
     ) -> Window | None:
         """Draw a luminous ball that passes through world points (n, 3) during the exposure.
 
-        Return the drawn window, or None if the ball is not visible.
+        Returns the drawn window, or None if the ball is not visible.
 
         adds: whether the light of the ball is added to the background; otherwise the ball hides the
             background.
@@ -482,7 +483,7 @@ class TwinCamera:
         """Draw the marker as a flat disc that passes through world points (n, 3) during the
         exposure.
 
-        Return the drawn window, or None if the disc is not visible or is seen from behind.
+        Returns the drawn window, or None if the disc is not visible or is seen from behind.
 
         The disc is a sum of Gaussian spots. For a disc larger than the blur, the sum is within 1 %
         of the light of a uniform disc.

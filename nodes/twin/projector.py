@@ -106,7 +106,8 @@ class LitSheet:
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
         """Store the parameters of the simulated devices.
 
-        camera, projector: true parameters. seed: random seed of the image noise.
+        camera, projector: true parameters.
+        seed: random seed of the image noise.
         """
         self._scene, self._camera, self._projector = scene, camera, projector
         self._random = np.random.default_rng(seed)
@@ -169,7 +170,7 @@ class LitSheet:
     ) -> tuple[slice, slice]:
         """Return the ranges of image rows and columns in which the sheet can be visible.
 
-        Return the whole image if a part of the sheet is behind the camera.
+        Returns the whole image if a part of the sheet is behind the camera.
         """
         height, width = self._camera.height_px, self._camera.width_px
         half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
@@ -225,7 +226,7 @@ def _fit_bend(points: Floats) -> Floats:
 def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Intersect rays (..., 3) from a point with the x-y plane of a pose (4, 4).
 
-    Return the points (..., 3), and a mask of the points in front of the origin.
+    Returns the points (..., 3), and a mask of the points in front of the origin.
     """
     normal = plane[:3, 2]
     slant = directions @ normal

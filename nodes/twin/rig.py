@@ -112,7 +112,8 @@ def project_ray(lens: Lens, u: T, v: T) -> tuple[T, T]:
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
     """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion; dy/du equals dx/dv.
 
-    u, v: x/z and y/z of the ray. x, y: these slopes after the distortion.
+    u, v: x/z and y/z of the ray.
+    x, y: these slopes after the distortion.
     """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v

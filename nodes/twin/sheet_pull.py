@@ -95,7 +95,7 @@ class SheetPull:
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
         """Compute the tension of the true sheet with the membrane model.
 
-        Return None if both arms are rigid, because then no flange is displaced.
+        Returns None if both arms are rigid, because then no flange is displaced.
         """
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n

@@ -67,7 +67,8 @@ class SheetReaction:
     def curve_n(self, distance_m: float, x_m: float, y_m: float) -> Floats:
         """Return the forces (d,), N, at `depths_m`; zeros if the position is beside the sheet.
 
-        distance_m: distance between the edges. x_m, y_m: position relative to the sheet's centre.
+        distance_m: distance between the edges.
+        x_m, y_m: position relative to the sheet's centre.
         """
         if abs(x_m) >= 0.5 * distance_m or abs(y_m) >= 0.5 * self.height_m[0]:
             return np.zeros(len(self.depths_m))
@@ -117,8 +118,10 @@ def compute_reaction(
 ) -> SheetReaction:
     """Compute the force table with the membrane model. The sheet's weight is neglected.
 
-    stretches: stretch ratios (s,). depths_m: push depths (n,). Raises NotConvergedError if the
-    iteration does not converge for shallow pushes.
+    stretches: stretch ratios (s,).
+    depths_m: push depths (n,).
+
+    Raises NotConvergedError if the iteration does not converge for shallow pushes.
     """
 
     def push_n(stretch: float, across: float, along: float) -> Floats:

@@ -76,8 +76,9 @@ class SagTable:
     ) -> tuple[Floats, Floats, Floats]:
         """Return the sag (n,), m, along the normal, and its slopes (n,) along x and along y.
 
-        distances_m: distances (n,) between the edges. leans: vertical components (n,) of the sheet
-        normals. x_m, y_m: positions (n,) relative to the sheet's centre.
+        distances_m: distances (n,) between the edges.
+        leans: vertical components (n,) of the sheet normals.
+        x_m, y_m: positions (n,) relative to the sheet's centre.
         """
         stretches = np.clip(distances_m / self._width_m, *self._range)
         by_stretch = lagrange(self._stretches, stretches) / _compute_tension(stretches)

@@ -374,9 +374,9 @@ def deviate_apparatus(
 ) -> Apparatus:
     """Make an apparatus (true hardware parameters) in which only one parameter deviates.
 
-    key: row of the tolerance table; other keys raise KeyError. sigmas: size of the deviation, in
-    standard deviations of a normal distribution. All components of a vector deviate equally. Both
-    arms or lenses also deviate equally.
+    key: row of the tolerance table; other keys raise KeyError.
+    sigmas: size of the deviation, in standard deviations of a normal distribution. All components
+        of a vector deviate equally. Both arms or lenses also deviate equally.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)

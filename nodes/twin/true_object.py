@@ -125,7 +125,7 @@ class TrueBody:
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
     """Find the points of a mesh that are nearest to `points` (n, 3).
 
-    Return the triangle corners (n, 3) and barycentric weights (n, 3) of the nearest points. Raises
+    Returns the triangle corners (n, 3) and barycentric weights (n, 3) of the nearest points. Raises
     ValueError if all triangles have zero area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]

@@ -168,8 +168,8 @@ def _true_arm(arm: ArmSpec, truth: ArmTruth) -> ArmSpec:
 def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[float, ...]) -> Pose:
     """Return a pose after a translation in the parent frame and a rotation about its own origin.
 
-    shift_m: translation (3,). rotation_rad: rotation vector (3,). With a zero rotation, the angles
-    are exactly unchanged.
+    shift_m: translation (3,).
+    rotation_rad: rotation vector (3,). With a zero rotation, the angles are exactly unchanged.
     """
     rpy_rad = pose.rpy_rad
     if any(rotation_rad):
