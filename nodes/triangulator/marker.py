@@ -106,12 +106,13 @@ MarkerRejection = Literal["merged", "blurred"]
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A marker in an image, refined to subpixel accuracy: centre (2,) px, covariance (2, 2) px^2.
+    """A marker in an image, refined to subpixel accuracy.
 
+    centre, covariance: centre (2,), px, and its covariance (2, 2), px^2.
     radius: radius of the disc, or mean semi-axis of the ellipse, px.
     radius_deviation: standard deviation of the estimated radius, as a fraction of the radius.
     blur: standard deviation of the edge blur, px.
-    motion: displacement (x, y) during the exposure, px; its sign is unknown.
+    motion: displacement (x, y) during the exposure, px. Its sign cannot be determined.
     elongation: vector (e, f), px, for a flat marker that is seen at an angle; see the module
         `ellipse`.
     height: difference of grey levels between the marker and its surroundings.
@@ -130,7 +131,8 @@ class Marker:
 
 
 Refine = Callable[[Sequence[Image], Sequence[Blob], PixelNoise], list[Marker]]
-"""A function that refines blobs to markers, from one image per blob."""
+"""A function that refines blobs to markers. It receives one image per blob, the blobs, and the
+noise of the pixels."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
@@ -311,10 +313,12 @@ class SystematicError:
 
 
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
-"""The systematic error of the method `moments`, from simulations (`tests/test_marker.py`)."""
+"""The systematic error of the method `moments`, as measured in simulations
+(`tests/test_marker.py`)."""
 
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""The systematic error of the method `subpixel_fit`, from simulations (`tests/test_marker.py`)."""
+"""The systematic error of the method `subpixel_fit`, as measured in simulations
+(`tests/test_marker.py`)."""
 
 
 def moments(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
@@ -369,8 +373,8 @@ def _make_marker(
     """Make a marker from the result of a fit.
 
     motion: motion (x, y) during the exposure, px, which increases the systematic error.
-    is_blurred, is_merged: whether to reject the marker as out of focus, or as merged with another
-        spot.
+    is_blurred: whether to reject the marker because it is out of focus.
+    is_merged: whether to reject the marker because it is merged with another spot.
     """
     rejection_reason: MarkerRejection | None = "blurred" if is_blurred else None
     return Marker(
@@ -426,5 +430,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""The refinement of flat markers for each method. A method that has no entry detects round markers
-only."""
+"""The function that refines flat markers, for each refinement method. A method that has no entry
+detects only round markers."""

@@ -1,10 +1,10 @@
 """Compare the positions of projected marks on the sheet with their expected positions.
 
-A mark is on the ray of its projector pixel for any position of the sheet. The distance from this
-ray therefore indicates errors of the projector and the camera. The distance from the expected
-surface of the sheet indicates errors of the arms and the camera. Near a finger that pushes the
-sheet, the surface moves by a known fraction of the pad's motion. There the marks indicate errors of
-the pad's depth.
+Wherever the sheet is, a projected mark is on the ray of its projector pixel. The distance of a mark
+from this ray therefore indicates errors of the projector and the camera. The distance of a mark
+from the expected surface of the sheet indicates errors of the arms and the camera. Near a finger
+that pushes the sheet, the sheet moves by a known fraction of the finger's motion. Marks near the
+finger therefore indicate errors of the finger's depth.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ standard deviation of 0.12 mm per axis, and a calibrated projector 0.03 mm."""
 
 SURFACE_THRESHOLD_M = 1.2e-3
 """The maximum mean distance of the marks from the sheet's surface: about five standard deviations.
-The camera contributes 0.12 mm. Per arm, base and clamp contribute 0.2 mm, and joint zero positions
-0.2 mm (docs/apparatus.md)."""
+The camera contributes 0.12 mm. Each arm contributes 0.2 mm by its base and clamp, and 0.2 mm by the
+zero positions of its joints (docs/apparatus.md)."""
 
 FINGER_THRESHOLD_M = 2e-3
 """The maximum error of the finger's depth in the sheet. The marker's offset contributes a standard
@@ -37,8 +37,8 @@ LATENCY_THRESHOLD_S = 0.01
 of a measurement by photodiode (1 ms)."""
 
 LATENCY_MEMORY_S = 4.0
-"""The time constant for averaging the latency. Only images that show the previous frame contain
-information, and these images are rare."""
+"""The time constant for averaging the latency. It is long because the latency can be measured only
+in the few camera images that still show the previous frame."""
 
 MATCH_RADIUS_M = 0.012
 """The maximum distance between a detected point and the expected position of its mark."""
@@ -50,11 +50,12 @@ MAX_AGE_NS = 300_000_000
 """The maximum age of the newest displayed frame at the exposure of an image pair."""
 
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
-"""The speed of the marks below which positions are checked, and above which latency is checked."""
+"""The speed of the marks below which their positions are checked, and the speed above which the
+latency is checked."""
 
 MAX_DRIFT_M = 3e-4
-"""The maximum motion of a mark along the sheet's normal between frame and exposure. If a mark moves
-more, its height above the sheet is not checked."""
+"""The maximum motion of a mark along the sheet's normal between the display of a frame and the
+exposure of an image. If any mark moves more, no height above the sheet is checked."""
 
 MAX_GAIN = 4.0
 """The maximum ratio of the standard deviations of the finger's estimated depth and a mark's height.
@@ -97,8 +98,8 @@ class ProjectionCheck:
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
         """Compare the bright points (3,), m, of an image pair with the expected marks.
 
-        camera_shift_m: displacement (3,) of the fixed reference marks that an error of the camera's
-            pose causes.
+        camera_shift_m: displacement (3,) by which an error of the camera's pose shifts the measured
+            positions of the fixed reference marks.
         at_ns: time of the image pair.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
@@ -142,11 +143,11 @@ class ProjectionCheck:
             self._latency.add(np.array([late]), at_ns)
 
     def _velocities(self, number: int) -> Floats | None:
-        """Return the velocities (n, 3), m/s, of the marks in a frame; NaN for marks off the sheet.
+        """Return the velocities (n, 3), m/s, of the n marks in a frame.
 
         number: index of the frame in `_frames`.
 
-        Returns None if no velocity is known.
+        The velocity is NaN if a mark is not on the sheet. Returns None if no velocity is known.
         """
         if number == 0:
             return None
@@ -203,7 +204,7 @@ class ProjectionCheck:
 def make_check(
     cause: SuspectedCause, monitor: ResidualMonitor, *, suspected: bool | None = None
 ) -> SelfCheck:
-    """Make the result of a self-check from the monitor of a residual.
+    """Make the result of a self-check from the monitor of its residual.
 
     suspected: whether the cause is suspected; None if the monitor decides.
     """

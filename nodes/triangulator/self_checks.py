@@ -51,8 +51,8 @@ class CameraCheck:
     reference_marks: world positions (n, 3), m, of fixed marks that look like the finger's marker.
     touch_point: world position (3,), m, of a known point that the finger can touch; None if no
         point is known.
-    projector: projector of the scene, which may project check marks on the sheet; None if there is
-        none.
+    projector: projector of the scene, which may project check marks on the sheet; None if the scene
+        has no projector.
     """
 
     def __init__(
@@ -101,7 +101,8 @@ class CameraCheck:
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
         """Remove the fixed marks and the projected marks from a detection.
 
-        tracked: whether the finger was searched in a gate. Markers inside the gate then remain.
+        tracked: whether the finger was searched for in a gate. If so, no marker inside the gate is
+            removed.
         """
         marks = np.concatenate([self._marks, self._projection.expected_world_m])
         if not len(marks):

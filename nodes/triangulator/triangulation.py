@@ -32,7 +32,10 @@ MAX_DISTANCE_M = 1e4
 
 @dataclass(frozen=True, slots=True)
 class StereoGeometry:
-    """The geometry of a stereo camera: camera matrices 3x3, distortions (5,), transforms 4x4."""
+    """The geometry of a stereo camera.
+
+    It consists of camera matrices (3, 3), lens distortions (5,) and transforms (4, 4).
+    """
 
     device: str
     width_px: int
@@ -83,7 +86,9 @@ class StereoGeometry:
         return project_with_jacobian(point, self.matrices[view], self.distortions[view])
 
     def undistort(self, view: int, pixel: Floats) -> tuple[float, float] | None:
-        """Return the undistorted normalized coordinates of a pixel (2,), or None if it is invalid.
+        """Return the undistorted normalized coordinates of a pixel (2,).
+
+        Returns None if the pixel is invalid for the lens model.
 
         view: 0 for the left camera, 1 for the right camera.
         """
@@ -189,8 +194,8 @@ class ClosestApproach:
 def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
     """Triangulate points by the direct linear transform (homogeneous linear least squares).
 
-    left, right: undistorted normalized coordinates (n, 2).
-    right_from_left: transform (4, 4).
+    left, right: undistorted normalized coordinates (n, 2) in both views.
+    right_from_left: transform (4, 4) from the left to the right camera's frame.
 
     Returns points (n, 3), m, in the left camera's frame.
 
@@ -210,7 +215,8 @@ def project_with_jacobian(
 ) -> tuple[Floats, Floats]:
     """Return the pixel (2,) of a point (3,), m, in the camera's frame, and its Jacobian.
 
-    The Jacobian is (2, 3), px/m. Python numbers are ten times as fast as arrays with two elements.
+    The Jacobian (2, 3) is in px/m. The function computes with Python numbers, which are ten times
+    as fast as arrays with two elements.
     """
     px, py, pz = point.tolist()
     fx, fy, cx, cy = _intrinsics(matrix)
