@@ -79,7 +79,7 @@ class TwinArmsParameters(SimulatorParameters):
 
 
 def open_joints_file(path: str | None) -> dict[str, Floats]:
-    """Map a file that stores the joint angles (rad) of both arms to arrays.
+    """Open a file that stores the joint angles (rad) of both arms, as memory-mapped arrays.
 
     Returns one array (6,) per side. The arrays contain NaN if the file is new or `path` is None.
     Raises OSError if the file cannot be opened.
@@ -211,7 +211,7 @@ class TwinArmsNode(Node):
     def _start_joints(self, side: str, scene: Scene) -> Floats:
         """Return the encoder angles (6,), rad, at which an arm starts.
 
-        There, the sheet lies in the screen plane (z = 0) with the scene's minimum stretch.
+        At these angles, the sheet is in the screen plane (z = 0) with the scene's minimum stretch.
         """
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
@@ -229,7 +229,7 @@ class TwinArmsNode(Node):
             self._stored_joints[side][:] = controller.servo.joints_rad
 
     def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
-        """Set the joint torques that the sheet's tension causes in the controllers.
+        """Pass to the controllers the joint torques that the sheet's tension causes.
 
         Only controllers with the protocol MXT report torques.
         """

@@ -40,11 +40,12 @@ MIN_CHARUCO_FRACTION = 0.6
 """The minimum fraction of the corners of a ChArUco board that must be visible in both images."""
 
 CHARUCO_NEARER = 1.2
-"""The ratio of the image size of a ChArUco board to that of a chessboard."""
+"""The factor by which a ChArUco board appears larger in the image than a chessboard. Only a part of
+a ChArUco board must be visible."""
 
 
 class BoardError(FlexsheetError, ValueError):
-    """Raised for a board that cannot be rendered."""
+    """An error for a board that cannot be rendered."""
 
     code = "board"
     exit_code = 2
@@ -71,7 +72,7 @@ class TwinBoard:
     """A simulated stereo camera that views a calibration board.
 
     camera: true lenses and poses.
-    seed: determines noise, illumination and poses.
+    seed: random seed of the noise, the illumination and the poses.
     """
 
     def __init__(self, camera: StereoCamera, board: Board, *, seed: int) -> None:
@@ -236,7 +237,7 @@ class TwinBoard:
 
         The board appears at the centre, corners and edges of the image, at several distances, with
         tilts in all directions. It is as far from the image centre as possible while both images
-        show the whole board (most of a ChArUco board).
+        show the whole board, or most of a ChArUco board.
         """
         board = self.board
         board_centre = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
@@ -299,10 +300,10 @@ class TwinBoard:
 
 
 def _measure_rise(place: Singles) -> Singles:
-    """Return how much a board coordinate changes from one ray to the next ray of a row or column.
+    """Return the change of a board coordinate from one ray to the next ray of a row or column.
 
-    Each pixel has several rays. The change is computed for one of them, because it hardly varies
-    within a pixel.
+    Each pixel has several rays. The change is computed for only one ray per pixel, because it
+    hardly varies within a pixel.
 
     place: board coordinate (rows, columns) of each ray.
     """
@@ -314,7 +315,9 @@ def _measure_rise(place: Singles) -> Singles:
 
 
 def _markers(board: Board) -> NDArray[np.bool_]:
-    """Return whether each cell of the ChArUco markers is black, (rows + 1, columns + 1, n, n).
+    """Return an array (rows + 1, columns + 1, n, n) that is True where a marker's cell is black.
+
+    rows, columns: numbers of inner corners of the ChArUco board.
 
     A marker has n cells per side, including its black border. Markers are numbered by row over the
     white squares. The first square of the board is black, as in OpenCV. Raises BoardError if the

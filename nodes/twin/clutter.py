@@ -35,7 +35,7 @@ class Trajectory(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FixedPoint:
-    """A trajectory of an object that does not move."""
+    """The trajectory of an object that does not move."""
 
     point: Point
 
@@ -124,9 +124,9 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """A set of cluttering objects. They are drawn in the order of the fields.
+    """The clutter objects of a scene, which are drawn in the order of this class's fields.
 
-    The finger with its marker is drawn after `limbs`.
+    The finger and its marker are drawn after `limbs`.
     """
 
     sheet: Sheet | None = None
@@ -155,8 +155,8 @@ def touching_highlight(overlap: float) -> Clutter:
 def covered(share: float, *, views: Views = "both") -> Clutter:
     """Return clutter that consists of an occluder with a straight edge across the marker.
 
-    share: hidden fraction (0 to 1) of the marker, from the side +x. With 1, the blurred edge of the
-        marker is also hidden.
+    share: hidden fraction (0 to 1) of the marker, from the side +x. If it is 1, the blurred edge of
+        the marker is also hidden.
     views: cameras in which the marker is hidden.
     """
     radius_m = 0.05
@@ -246,8 +246,7 @@ PASSING = Clutter(
         ),
     ),
 )  # fmt: skip
-"""Moving clutter: a bead as bright as the marker, reflections, and cables in front of the finger.
-"""
+"""Moving clutter: a bead as bright as the marker, reflections, and cables before the finger."""
 
 CLUTTER = {
     "none": Clutter(),

@@ -32,7 +32,7 @@ RIM_PX = 3
 decoded position."""
 
 COARSE_LIGHT = 0.1
-"""The fraction of the maximum blue below which a pixel does not belong to the object."""
+"""The fraction of the maximum blue level below which a pixel does not belong to the object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class ErrorMap:
 
     @property
     def sizes_m(self) -> Floats:
-        """Return the absolute errors (n,) of all decoded points."""
+        """Return the absolute errors (n,), m, of all n decoded points."""
         sizes = np.linalg.norm(self.errors_m, axis=2)
         return np.asarray(sizes[np.isfinite(sizes)])
 
@@ -77,7 +77,10 @@ def _lit(picture: Image) -> Bools:
 
 
 def _places(picture: Image) -> tuple[Floats, Bools]:
-    """Return the position (m) that each pixel encodes, and its validity, both (rows, columns)."""
+    """Return the position (m) that each pixel encodes, and a mask of valid positions.
+
+    Both arrays have the shape (rows, columns).
+    """
     red, green, blue = np.moveaxis(picture.astype(np.float64) / 127.5 - 1.0, -1, 0)
     phase = np.arctan2(green, red) / (2.0 * np.pi)
     coarse = ((0.5 * (blue + 1.0) - 0.2) / 0.8 - 0.5) * RANGE_M

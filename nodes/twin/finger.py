@@ -33,7 +33,7 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """Raised for a path that the simulated finger cannot follow."""
+    """An error for a path that the simulated finger cannot follow."""
 
     code = "finger-path"
     remedy = "Slow the path down, or correct the point or line that the text names."
@@ -81,7 +81,7 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """Return the time (s, at most 0) at which the finger leaves the first point."""
+        """Return the time (s) at which the finger leaves the first point; it is at most 0."""
         ...
 
     def speeds(self) -> Floats:
@@ -424,7 +424,8 @@ class FingerMotion:
 def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
     """Return the tremor amplitude (m) on a path.
 
-    A tremor in the true parameters `finger` replaces the tremor of a path, if the path has one.
+    If the path has a tremor and the true parameters `finger` contain a tremor, the tremor in the
+    true parameters is used.
     """
     if finger is None or finger.tremor_rms_m is None or not path_tremor_m:
         return path_tremor_m

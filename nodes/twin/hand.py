@@ -101,7 +101,7 @@ class Touch:
 
     origin (3,): point of the unloaded sheet's tangent plane, m.
     normal (3,): its unit normal towards the user.
-    curve_n (d,): normal forces at the depths in the force table `SheetReaction`.
+    curve_n (d,): normal forces at the d depths in the force table `SheetReaction`.
     """
 
     origin: Floats
@@ -187,8 +187,8 @@ class CoupledFinger:
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
         """Return a copy of this simulation, advanced to `time_s`.
 
-        If this simulation is more than MAX_PREDICTION_S behind `time_s`, it is advanced to this
-        limit.
+        If this simulation is more than MAX_PREDICTION_S behind `time_s`, it is first advanced
+        until it is MAX_PREDICTION_S behind.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)
@@ -204,8 +204,9 @@ class CoupledFinger:
         return position + self.deviation_m, velocity + self.rate_m_per_s
 
     def advance(self, until_s: float, edges: Edges) -> None:
-        """Integrate the motion until `until_s`. If the motion is already computed to this time, do
-        nothing.
+        """Integrate the motion until `until_s`.
+
+        If the motion is already computed to this time, nothing changes.
         """
         span_s = until_s - self.time_s
         if span_s <= 0.0:

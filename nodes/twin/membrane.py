@@ -41,8 +41,8 @@ SLACK_TENSION = 2e-4
 tension, the equilibrium of slack and wrinkled regions would not be unique."""
 
 CONTACT_PA_PER_M = 1e10
-"""The contact pressure per penetration depth, Pa/m. With it, a force of 10 N on 1 cm2 penetrates
-0.01 mm."""
+"""The contact pressure per penetration depth, Pa/m. At this value, a force of 10 N on 1 cm2
+penetrates by 0.01 mm."""
 
 MAX_STEP_RADII = 0.7
 """The maximum advance of the finger per step, in finger radii. A longer step could cross the
@@ -51,8 +51,9 @@ sheet."""
 MAX_ITERATIONS = 80
 
 UNDAMPED_ROUNDS = 6
-"""The number of equilibria in one finger step after which the applied changes of the friction
-forces are halved again. Without this damping, the changes may alternate."""
+"""The number of equilibria in one finger step after which the changes of the friction forces are
+halved. They are halved again after each further equal number. Without this damping, the changes
+could alternate."""
 
 MAX_FRICTION_ROUNDS = 30
 """The maximum number of equilibria that are solved per finger step while nodes slip."""
@@ -64,7 +65,7 @@ GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """Raised if the iteration for the membrane's equilibrium does not converge."""
+    """An error that is raised if the iteration for the membrane's equilibrium does not converge."""
 
     code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
@@ -291,9 +292,9 @@ class _Mesh:
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the larger and the smaller eigenvalue (...,) of C, and a unit eigenvector (..., 2).
 
-    The eigenvector belongs to the larger eigenvalue.
+    C is a symmetric 2x2 matrix. The eigenvector belongs to the larger eigenvalue.
 
-    c: components [C11, C22, C12] (..., 3).
+    c: components [C11, C22, C12] (..., 3) of C.
     """
     mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
     radius = np.hypot(half, c[..., 2])
@@ -417,9 +418,9 @@ class _Finger:
     def release(self, positions: Floats, fraction: float) -> bool:
         """Let the nodes slip whose friction force exceeds the Coulomb limit.
 
-        Returns whether forces changed; then a new equilibrium must be computed. The friction force
-        of a slipping node is the friction coefficient times the normal force. Its direction does
-        not change.
+        Returns whether forces changed. If so, a new equilibrium must be computed. The friction
+        force of a slipping node becomes the friction coefficient times the normal force. The
+        direction of the friction force does not change.
 
         fraction: applied fraction (0 to 1) of the change of the friction forces.
         """

@@ -59,7 +59,9 @@ class Nail:
         )
 
     def find_normal(self, radius_m: float) -> Floats | None:
-        """Return the direction (3,) from the finger's axis to the nail; None if it is round.
+        """Return the direction (3,) from the finger's axis to the nail.
+
+        Returns None if the finger is round.
 
         radius_m: half of the finger's breadth.
         """

@@ -113,12 +113,12 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the maximum length (m) of a stroke in one direction, and whether it reaches an
-        edge.
+        """Return the maximum length (m) of a stroke in one direction.
 
         The stroke starts at the front of the object and follows the geodesic in the direction
         `heading` (3,). It ends at an edge of the object, or at the maximum angle between the
-        surface normal and the direction to the user.
+        surface normal and the direction to the user. The second result is whether the stroke
+        reaches an edge.
 
         most: cosine of the maximum angle.
         """

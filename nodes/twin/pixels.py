@@ -66,17 +66,17 @@ ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
 window."""
 
 EMPTY_FRACTION = 1.2
-"""The maximum ratio of the area of a window that contains two windows to the sum of their areas. Up
-to this ratio, the two windows are joined."""
+"""The maximum area of a window that joins two windows, as a multiple of the sum of their areas. If
+the area would be larger, the two windows are not joined."""
 
 LIT_RADIUS_M, LIT_LEVEL = 0.0028, 150.0
-"""The radius (m) of a projected mark, and the grey level that the mark adds to the sheet. The area
-is that of 10 x 10 pixels of 0.5 mm."""
+"""The radius (m) of a projected mark, and the grey level that the mark adds to the sheet. The mark
+has the same area as 10 x 10 projector pixels of 0.5 mm."""
 
 NO_POINTS = np.zeros((0, 3))
 
 SPOTS = 61
-"""The number of Gaussian spots as whose sum a flat marker is drawn."""
+"""The number of Gaussian spots whose sum represents a flat marker."""
 
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -96,7 +96,7 @@ class Sensor:
     aperture_m, focus_m: aperture diameter and focused distance. The image of a point at depth z is
         a disc with the diameter focal_px * aperture_m * |1/z - 1/focus_m|. The disc is drawn as a
         Gaussian with the same standard deviation, a quarter of the diameter.
-    exposure: factor on all light. With a factor well above 1, the marker saturates.
+    exposure: factor by which all light is multiplied. If it is well above 1, the marker saturates.
     noisy_backgrounds: number of precomputed noisy background images per camera.
     """
 
@@ -240,7 +240,7 @@ class TwinCamera:
         marker_radius_m: float | None = None,
         marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
-        """Return a copy of the camera with another marker or sensor. The background is unchanged.
+        """Return a copy of the camera with another marker or sensor, and the same background.
 
         marker_offset_m: vector (3,) from the fingertip to the marker, in the world frame.
         """

@@ -218,7 +218,7 @@ class LitSheet:
 
 
 def _fit_bend(points: Floats) -> Floats:
-    """Fit a polynomial z(x, y), coefficients (5, 5), to points (n, 3) in the frame of the sheet."""
+    """Fit a polynomial z(x, y) to points (n, 3) in the sheet's frame; return its coefficients."""
     powers = polynomial.polyvander2d(points[:, 0], points[:, 1], [4, 4])
     return np.asarray(np.linalg.lstsq(powers, points[:, 2], rcond=None)[0].reshape(5, 5))
 
@@ -248,12 +248,11 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """Return the distances (n,), m, between intended and actual projected points, as an eye sees
-    them.
+    """Return the distances (n,), m, between intended and actual projected points.
 
-    The distances are measured on the imaginary screen (world plane z = 0). The points form a grid
-    of +-half_m on each plane (4, 4). The calibrated projector `believed` computes their pixels, and
-    the projector `true` projects these pixels.
+    The distances are measured as an eye sees them on the imaginary screen (world plane z = 0). The
+    points form a grid of +-half_m on each plane (4, 4). The calibrated projector `believed`
+    computes their pixels, and the projector `true` projects these pixels.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

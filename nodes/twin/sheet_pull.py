@@ -1,4 +1,4 @@
-"""Compute the true sheet, and the displacement of the arms by its tension and weight.
+"""Compute the shape of the true sheet, and how far its tension and weight displace the arms.
 
 An apparatus contains the true parameters of the simulated hardware. A flange is the last link of an
 arm.
@@ -79,7 +79,7 @@ class SheetPull:
     The force of a finger on the sheet is neglected, because it is small compared with the tension.
 
     distances_m, forces_n (n,): tension as a function of the distance between the clamped edges.
-    compliances_m_per_n: displacement of the left and right flange per force.
+    compliances_m_per_n: displacements of the left and the right flange per force.
     weight_n (3,): weight of the sheet. Each flange carries half of the weight.
     history: hysteresis and creep of the tension; None if the rubber is elastic.
     """

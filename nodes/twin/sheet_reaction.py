@@ -53,8 +53,8 @@ class SheetReaction:
     stretches (s,): stretch ratios.
     depths_m (d,): depths in equal steps from 0.
     centre_n (s, d): force at the centre.
-    ratios (p, p, d): ratio of the force at POSITION_FRACTIONS of width and height to the force at
-        the centre.
+    ratios (p, p, d): force divided by the force at the centre, at the p POSITION_FRACTIONS of the
+        width and of the height.
     """
 
     width_m: Floats
@@ -65,7 +65,9 @@ class SheetReaction:
     ratios: Floats
 
     def curve_n(self, distance_m: float, x_m: float, y_m: float) -> Floats:
-        """Return the forces (d,), N, at `depths_m`; zeros if the position is beside the sheet.
+        """Return the forces (d,), N, at `depths_m`.
+
+        The forces are zero if the position is beside the sheet.
 
         distance_m: distance between the edges.
         x_m, y_m: position relative to the sheet's centre.
@@ -86,7 +88,10 @@ class SheetReaction:
 def load_or_compute_reaction(
     scene: Scene, apparatus: Apparatus | None, cache_dir: Path | None = None
 ) -> SheetReaction:
-    """Return the force table of a scene's true sheet from the cache, or compute it in 10 s."""
+    """Return the force table of a scene's true sheet from the cache, or compute the table.
+
+    The computation takes 10 s.
+    """
     true_scene = apply_apparatus(scene, apparatus)
     sheet = true_scene.sheet
     rubber = replace(

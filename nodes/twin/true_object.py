@@ -49,7 +49,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """The surface mesh of a scene's virtual object; a plane becomes a rectangle."""
+    """The surface mesh of a scene's virtual object. A plane is represented by a rectangle."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -218,7 +218,10 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return the vertices and triangles of a closed surface over the directions `_directions`."""
+    """Return vertices, and the triangles that connect them to a closed surface.
+
+    vertices (n, 3): one vertex in each direction that `_directions` returns, in the same order.
+    """
     rows, count = 2 * ALONG - 1, len(vertices)
     first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
     caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]

@@ -45,7 +45,7 @@ class SimulatorParameters(NodeParameters):
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return the delay (s) of the true display of a frame after the time that the renderer assumes.
+    """Return the delay (s) of a frame's true display after the time that the renderer assumes.
 
     The frame contains the latency that the renderer assumes. If no frame has been displayed, the
     nominal latency is used. The result is 0 if there is no apparatus.

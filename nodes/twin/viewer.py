@@ -40,8 +40,9 @@ class HeadSway:
 
     @classmethod
     def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
-        """Generate a random head motion from the true eye parameters. Return None if the head is at
-        rest.
+        """Generate a random head motion from the true eye parameters.
+
+        Returns None if the head is at rest.
         """
         if not eyes.sway_m:
             return None
