@@ -2,8 +2,8 @@
 
 Each filter assumes one motion model: white noise in the acceleration or in the jerk, alone or with
 an oscillator. The prediction is the weighted sum of the filters' predictions. The weights minimise
-the mean square error of the sum at the prediction horizon, according to the covariance of the
-filters' errors in the last seconds. Weights may be negative, so the sum can represent motion
+the mean square error of the sum at the prediction horizon. They are computed from the covariance of
+the filters' errors in the last seconds. Weights can be negative, so the sum can represent motion
 spectra that no single model has.
 
 Sources: Bates and Granger, Operational Research Quarterly 20, 1969 (combination by the covariance
@@ -321,7 +321,7 @@ def combine(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class BankEstimate(Estimate):
-    """An estimate of the filter bank: states (models, 5, 3) at one time, and adapted weights.
+    """The estimate of a filter bank at one time: the states (models, 5, 3), and their weights.
 
     covariance: noise covariance (3, 3), m^2, of the newest measured point in the world frame.
     axes: axes of the states as columns (3, 3) in the world frame. The measurement noise is
@@ -331,7 +331,7 @@ class BankEstimate(Estimate):
         scored horizon.
     error_covariance: covariance (scored horizons, 3, models, models), m, of the models' prediction
         errors by axis, divided by the square root of the errors' magnitude.
-    weights: weights (scored horizons, 3, models) with the sum 1 over the models.
+    weights: weights (scored horizons, 3, models), whose sum over the models is 1.
     recent: recent mean square errors (scored horizons, 3, models + 1), m^2, of each model and of
         the weighted sum.
     scored_ages_ms: ages (ms) of the predictions that were compared with the newest point.

@@ -26,8 +26,9 @@ from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
 """The status of a track that is not the finger's track.
 
-tentative: the marker may be the finger, and may start the finger's track.
-ambiguous: the marker may be the finger or clutter, and must not start the finger's track yet.
+tentative: the marker is possibly the finger's marker, and can start the finger's track.
+ambiguous: it is uncertain whether the marker is the finger's marker, so it cannot start the
+    finger's track yet.
 clutter: the marker is not the finger."""
 
 POSITION_SIGMA_M = 0.0005
@@ -48,16 +49,16 @@ MAX_POSITION_SIGMA_M = 0.1
 """The upper bound of the predicted position error of a track."""
 
 MIN_APPEARANCE_SIGMA = np.array([0.01, 0.02])
-"""The minimum relative standard deviations of the grey levels of one marker and of its
-surroundings, from image to image."""
+"""The minimum relative standard deviations with which the grey levels of a marker and of its
+surroundings vary from image to image."""
 
 INITIAL_APPEARANCE_SIGMA = np.array([0.04, 0.08])
 """The initial relative standard deviations of the grey levels of a new track's marker and of its
 surroundings."""
 
 POPULATION_APPEARANCE_SIGMA = np.array([0.2, 0.4])
-"""The relative standard deviations of the grey levels between different markers, and between their
-surroundings."""
+"""The relative standard deviations with which the grey levels vary between different markers, and
+between their surroundings."""
 
 APPEARANCE_TIME_CONSTANT_S = 0.2
 """The time constant for averaging the appearance (grey levels) of a marker."""
@@ -479,7 +480,7 @@ def assign_columns(costs: Floats) -> list[int]:
 
 
 def _ambiguous_rows(costs: Floats, columns: Sequence[int], finger: int) -> set[int]:
-    """Return the rows of the markers that may be either the finger or clutter.
+    """Return the rows of the markers that could be either the finger or clutter.
 
     costs: cost of assigning each marker (row) to each track (column).
     columns: column of the track that is assigned to each marker.

@@ -443,8 +443,8 @@ def _unique_candidates(
 ) -> tuple[Candidate, ...]:
     """Return the markers of refined pairs, sorted by cost.
 
-    A pair is dropped if its blobs probably show two different markers. This is the case if both
-    blobs belong to pairs with lower costs, or if one blob belongs to a pair with a much lower cost.
+    A pair is dropped if its blobs probably show two different markers: both blobs belong to pairs
+    with lower costs, or one blob belongs to a pair with a much lower cost.
     """
     unique: list[RefinedPair] = []
     for one in sorted(

@@ -32,8 +32,8 @@ NEIGHBOURHOOD_PX = 31
 """The side of the square around a pixel whose mean grey level is the threshold for this pixel."""
 
 SURROUND_PX = 3
-"""The width of the border around a blob. The outermost pixels determine the grey level of the
-blob's surroundings."""
+"""The width of the border around a blob. The border's outermost pixels determine the grey level of
+the blob's surroundings."""
 
 SURROUND_RANK = 0.75
 """The quantile of the surrounding pixels that is used as the grey level of the surroundings. A high
@@ -188,7 +188,10 @@ def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = 
 
 
 def _count_pixels(outline: cv2.typing.MatLike) -> float:
-    """Return the number of pixels inside and on an outline of pixel centres (Pick's theorem)."""
+    """Return the number of pixels inside and on an outline between pixel centres.
+
+    The number follows from Pick's theorem.
+    """
     return cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
 
 

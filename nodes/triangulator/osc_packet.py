@@ -26,7 +26,7 @@ def read_packet(data: bytes) -> Iterator[tuple[str, list[float]]]:
         (size,) = struct.unpack_from(">i", data, offset)
         end = offset + 4 + size
         if size <= 0 or end > len(data):
-            raise ValueError(f"OSC bundle of {len(data)} bytes: an element states {size} bytes")
+            raise ValueError(f"OSC bundle of {len(data)} bytes: an element size is {size} bytes")
         yield from read_packet(data[offset + 4 : end])
         offset = end
 

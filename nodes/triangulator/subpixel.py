@@ -46,14 +46,14 @@ otherwise 0."""
 
 WHITE = 255
 MARGIN_PX = 3.0
-"""The width of the surroundings of a disc at rest that the fit uses. The finger's edge, where the
+"""The width of the border that the fit uses around a disc at rest. The finger's edge, where the
 background is not linear, is farther away."""
 
 MIN_MARGIN_PX = 1.25
-"""The minimum width of the surroundings of a moving disc that the fit uses."""
+"""The minimum width of the border that the fit uses around a moving disc."""
 
 MARGIN_PER_MOTION = 0.5
-"""The reduction of the width of a disc's surroundings, as a fraction of the disc's motion during
+"""The reduction of the width of the border around a disc, as a fraction of the disc's motion during
 the exposure."""
 
 PRIOR_WEIGHTS = np.array(

@@ -121,7 +121,7 @@ class ImageMismatchError(FlexsheetError, ValueError):
     """An error for images that cannot come from the scene's camera."""
 
     code = "image-mismatch"
-    remedy = "Set the camera in the scene to the one that took the images."
+    remedy = "Change the camera in the scene to the camera that took the images."
 
 
 def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:

@@ -59,8 +59,8 @@ class TwinArmsParameters(SimulatorParameters):
     protocol: Literal["modbus", "mxt"] = "modbus"
     cycle_s: NonNegative = Field(
         default=0.0,
-        description="Modbus: period of the controller cycles, at whose start set-points take "
-        "effect, s; 0: set-points take effect at once",
+        description="Modbus: period of the controller, s. Set-points take effect at the start of "
+        "a period; 0: set-points take effect immediately",
     )
     restart_after_s: Positive = Field(
         default=2.0,

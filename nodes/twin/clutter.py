@@ -224,7 +224,7 @@ CLAMPS = Clutter(
         Highlight(FixedPoint((0.135, -0.04, 0.01)), 0.0008, 150.0),
     )
 )
-"""Reflections on the clamps of the sheet's edges."""
+"""Reflections on the clamps that hold the sheet's edges."""
 
 PASSING = Clutter(
     markers=(SecondMarker(Oscillation((0.0, 0.05, 0.02), (0.14, 0.02, 0.0), 7.3)),),

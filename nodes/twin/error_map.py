@@ -1,8 +1,8 @@
 """Measure the image error at each point of the object from position codes that are drawn on it.
 
-In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point encodes the x
-or y coordinate at which the eye should see the point on the imaginary screen (z = 0). Red and green
-are the cosine and the sine of a phase. Blue encodes the coarse position. The image error is the
+The eye should see each point of the object at certain coordinates on the imaginary screen (z = 0).
+The colours of the patterns `coordinate_ramp_x` and `coordinate_ramp_y` encode x and y. Red and
+green are the cosine and the sine of a phase. Blue encodes the coarse position. The image error is the
 position at which the eye sees a point minus the encoded position.
 """
 

@@ -53,8 +53,8 @@ class TwinEyeParameters(SimulatorParameters):
     )
     eye_stale_s: Positive = Field(
         default=0.1,
-        description="maximum age of the tracked eye position, s; with an older one, the eyes of "
-        "the scene are used",
+        description="maximum age of the tracked eye position, s; if the position is older, the "
+        "eyes of the scene are used",
     )
     min_interval_s: Positive = Field(
         default=5.0, description="minimum time between two rendered frames of the same label, s"

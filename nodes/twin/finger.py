@@ -282,8 +282,8 @@ class FingerMotion:
     ease_s: duration of the motion to the first point.
     amplitudes_before_m, amplitudes_m: amplitudes of wander and tremor before the path message and
         on the path. During the motion to the first point, they are interpolated.
-    age_s: time argument of wander and tremor when the path message arrived. Later motions continue
-        this time, so wander and tremor have no jumps.
+    age_s: time at which wander and tremor are evaluated when the path message arrives. It includes
+        the duration of earlier motions, so wander and tremor do not jump.
     """
 
     path: Path
@@ -384,8 +384,9 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return position (m) and velocity (m/s) without wander and tremor, and both amplitudes
-        (m).
+        """Return position (m) and velocity (m/s) without wander and tremor.
+
+        The third result contains the amplitudes (m) of wander and tremor.
         """
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))

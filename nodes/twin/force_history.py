@@ -41,7 +41,7 @@ decade."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
 """The time (s) in which the elastic force of a push rises to the force at which the hysteresis is
-evaluated, and the ratio of the maximum force to this force. The finger reverses at the maximum
+evaluated. The second value is the ratio of the maximum force, at which the finger reverses, to this
 force."""
 
 

@@ -20,7 +20,7 @@ The gestures follow published measurements of human motion:
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
     motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
 - Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411). Its amplitude is
-    0.03 mm with the hand at rest, 0.06 mm with the hand held out, and 0.12 to 0.15 mm with the arm
+    0.03 mm if the hand rests, 0.06 mm if the hand is held out, and 0.12 to 0.15 mm if the arm is
     held out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).
 - Most of the motion of a finger at rest has frequencies of 1-3.5 Hz and below (Carignan, Daneault
     and Duval 2009, Exp. Brain Res. 201:299). This motion is called wander in this package.

@@ -57,7 +57,7 @@ UP = np.array([0.0, 1.0, 0.0])
 class HandImpedance:
     """The mechanical impedance of a hand at the fingertip, equal in all directions.
 
-    The default values describe a finger that moves together with the wrist. Their natural frequency
+    The default values describe a finger that moves together with the wrist. Its natural frequency
     without contact is 5 Hz (Lakie et al. 2015: 6 to 12 Hz with less mass).
     """
 
@@ -140,7 +140,7 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """A linear extrapolation of the last two samples of the poses of the sheet's edges."""
+    """A function that extrapolates linearly the last two poses of the sheet's edges."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []
@@ -168,7 +168,7 @@ class EdgeTrack:
 
 
 class CoupledFinger:
-    """A simulation of the finger's deviation from its voluntary path by the force of the sheet.
+    """A simulation of how far the sheet's force moves a finger away from its voluntary path.
 
     path: voluntary motion; it may be replaced at any time.
     deviation_m, rate_m_per_s (3,): deviation and its rate of change.

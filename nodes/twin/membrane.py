@@ -2,9 +2,9 @@
 
 The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is W = mu/2
 (I1 - 3), where I1 is the first strain invariant and mu = E/3 is the shear modulus. A membrane has
-no bending stiffness. Under compression, it would buckle into infinitely fine wrinkles. There, the
-energy of a tension field is used instead of W (Pipkin, IMA J. Appl. Math. 36, 1986). The stress is
-uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. The relaxed energy
+no bending stiffness. Under compression, it would buckle into infinitely fine wrinkles. In wrinkled
+regions, the energy of a tension field replaces W (Pipkin, IMA J. Appl. Math. 36, 1986). The stress
+is uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. This energy
 is convex in the strain, so Newton's method with a line search finds its minimum.
 
 The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). The renderer uses other

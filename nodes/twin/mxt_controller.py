@@ -81,7 +81,7 @@ class MxtController:
     - a motion command before a packet that only requests the state
     - an unknown command or data type
     - joint angles outside the allowed range
-    - a first set-point away from the measured joint angles
+    - a first set-point that is far from the measured joint angles
     - a jump of the set-point
     - no packet for `timeout_s`
 

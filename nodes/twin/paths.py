@@ -381,5 +381,7 @@ def _read_recording(csv_path: Path) -> Floats:
             )
         rows.append(row)
     if len(rows) < 2:
-        raise FingerPathError(f"{csv_path}: {len(rows)} samples found; a path needs at least two")
+        raise FingerPathError(
+            f"{csv_path}: {len(rows)} samples found; give a path with at least two samples"
+        )
     return np.array(rows)

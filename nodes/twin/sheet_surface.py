@@ -58,7 +58,7 @@ class SheetPlanes:
 
 
 class SagTable:
-    """A table of the unloaded sheet's sag over stretch ratio, tilt and position."""
+    """A table of the unloaded sheet's sag as a function of stretch ratio, tilt and position."""
 
     def __init__(
         self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float

@@ -39,8 +39,8 @@ class SimulatorParameters(NodeParameters):
 
     apparatus: Apparatus | None = Field(
         default=None,
-        description="true hardware parameters, set by `--apparatus`; null: the true parameters are "
-        "those of the scene",
+        description="true hardware parameters, set by `--apparatus`; null: the true parameters "
+        "equal the parameters in the scene",
     )
 
 
