@@ -114,7 +114,7 @@ SOLE_CANDIDATE_TIME_S = 1.0
 track is `ambiguous`."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""The time since the finger's loss after which moving clutter may be selected as the finger."""
+"""The time since the finger's loss after which moving clutter can be selected as the finger."""
 
 
 @dataclass(slots=True)

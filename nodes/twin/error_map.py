@@ -2,8 +2,8 @@
 
 The eye should see each point of the object at certain coordinates on the imaginary screen (z = 0).
 The colours of the patterns `coordinate_ramp_x` and `coordinate_ramp_y` encode x and y. Red and
-green are the cosine and the sine of a phase. Blue encodes the coarse position. The image error is the
-position at which the eye sees a point minus the encoded position.
+green are the cosine and the sine of a phase. Blue encodes the coarse position. The image error is
+the position at which the eye sees a point minus the encoded position.
 """
 
 from __future__ import annotations

@@ -260,7 +260,7 @@ def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
 class FingerState:
     """The true state of the fingertip at one time.
 
-    position, velocity: (3,) in m and m/s.
+    position, velocity: position (3,), m, and velocity (3,), m/s.
     path_time_s: time since the first point of the path; negative before the finger reaches it.
     path_done: whether the finger has reached the end of the path.
     force: (3,) force of the sheet on the finger, N.

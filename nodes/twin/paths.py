@@ -156,8 +156,8 @@ class SurfaceMap:
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
     """Return the surface point nearest to a distant user.
 
-    If this point is on an end of the object, return the point that the user sees in the direction
-    of the object's origin.
+    If this point is on an end of the object, the result is the point that the user sees in the
+    direction of the object's origin.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:

@@ -321,8 +321,9 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
-        """Return the camera image: the drawn rectangles (`windows`) of the canvas on a noisy
-        background. Then reset the canvas.
+        """Return the camera image, and reset the canvas.
+
+        The image is a noisy background with the drawn rectangles (`windows`) of the canvas.
         """
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
