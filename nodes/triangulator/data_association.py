@@ -79,7 +79,7 @@ AMBIGUITY_MARGIN = 9.0
 deviations."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0
-"""The maximum squared appearance distance at which two detections may show the same marker, in
+"""The maximum squared appearance distance at which two detections can show the same marker, in
 squared standard deviations."""
 
 VELOCITY_TIME_CONSTANT_S = 0.05

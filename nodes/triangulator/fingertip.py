@@ -79,8 +79,8 @@ MAX_FLAT_PAIRS = 4
 """The maximum number of blob pairs that are refined as flat markers."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The cost difference between the best and the second best pair below which the marker is
-ambiguous, in squared standard deviations."""
+"""The minimum cost difference between the best and the second best pair, in squared standard
+deviations. If the difference is smaller, the marker is ambiguous."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,8 @@ The camera contributes 0.12 mm. Each arm contributes 0.2 mm by its base and clam
 zero positions of its joints (docs/apparatus.md)."""
 
 FINGER_THRESHOLD_M = 2e-3
-"""The maximum error of the finger's depth in the sheet. The marker's offset contributes a standard
-deviation of 0.3 mm, the camera 0.12 mm, the arms 0.25 mm, and noise 0.2 mm."""
+"""The maximum error of the finger's depth in the sheet. The standard deviations of its causes are
+0.3 mm (marker's offset), 0.12 mm (camera), 0.25 mm (arms) and 0.2 mm (noise)."""
 
 LATENCY_THRESHOLD_S = 0.01
 """The maximum deviation of the display latency from its configured value: ten standard deviations
@@ -44,7 +44,8 @@ MATCH_RADIUS_M = 0.012
 """The maximum distance between a detected point and the expected position of its mark."""
 
 MAX_SPREAD_M = 0.004
-"""The maximum difference between the offset of a mark and the median offset of all marks."""
+"""The maximum difference between the offset of a mark from its expected position and the median
+offset of all marks."""
 
 MAX_AGE_NS = 300_000_000
 """The maximum age of the newest displayed frame at the exposure of an image pair."""
@@ -58,8 +59,9 @@ MAX_DRIFT_M = 3e-4
 exposure of an image. If any mark moves more, no height above the sheet is checked."""
 
 MAX_GAIN = 4.0
-"""The maximum ratio of the standard deviations of the finger's estimated depth and a mark's height.
-If the ratio is larger, the marks are too far from the finger, and the depth is not estimated."""
+"""The maximum standard deviation of the finger's estimated depth, as a multiple of the standard
+deviation of a mark's height. If the multiple is larger, the marks are too far from the finger, and
+the depth is not estimated."""
 
 
 class ProjectionCheck:

@@ -30,7 +30,8 @@ MARK_THRESHOLD_M = 6e-4
 
 MARKER_THRESHOLD_M = 1.5e-3
 """The maximum distance of a resting finger from the known point: more than four standard
-deviations. The marker offset contributes 0.3 mm per axis, the camera 0.12 mm, and noise 0.1 mm."""
+deviations. The standard deviations per axis of the causes are 0.3 mm (marker's offset), 0.12 mm
+(camera) and 0.1 mm (noise)."""
 
 MARK_RADIUS_M = 0.008
 """The maximum distance between a detected point and its reference mark."""

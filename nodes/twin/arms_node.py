@@ -114,7 +114,10 @@ def joint_torques_nm(
 
 
 class TwinArmsNode(Node):
-    """A node that simulates both arms and the sheet between them, from the first scene onwards."""
+    """A node that simulates both arms and the sheet between them.
+
+    The simulation starts when the first scene arrives.
+    """
 
     role: ClassVar[NodeRole | None] = NodeRole.ARM_SIMULATOR
     opens_devices: ClassVar[bool] = True

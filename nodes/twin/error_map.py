@@ -28,8 +28,8 @@ AGREES_M = 0.002
 larger difference is ignored. One step of blue is 1.2 mm."""
 
 RIM_PX = 3
-"""The width of the object's outline that is ignored, px. There, mixing with black would change the
-decoded position."""
+"""The width of the ignored outline of the object, px. In the outline, a mixture with black would
+change the decoded position."""
 
 COARSE_LIGHT = 0.1
 """The fraction of the maximum blue level below which a pixel does not belong to the object."""

@@ -85,7 +85,7 @@ class Rays:
 class Hits:
     """The first intersection of each ray through an image with a mesh.
 
-    triangle (height, width): index of the triangle that the ray hits; -1 if it hits none.
+    triangle (height, width): index of the triangle that the ray hits; -1 if there is no hit.
     inverse_range (height, width): reciprocal of the ray parameter at the hit; 0 if there is no hit.
     weights (triangles, 3, 3): matrices that map (1, column, row) to unnormalized barycentric
         weights.

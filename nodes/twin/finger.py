@@ -85,7 +85,7 @@ class Path(Protocol):
         ...
 
     def speeds(self) -> Floats:
-        """Return upper bounds (n - 1,), in m/s, on the speed between successive points."""
+        """Return upper bounds (n - 1,), in m/s, on the speed between n successive points."""
         ...
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
@@ -126,7 +126,10 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,), m/s, on the lines. The rounded motion is not faster."""
+        """Return the speeds (n - 1,), m/s, on the lines between n points.
+
+        The rounded motion is not faster.
+        """
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
@@ -186,7 +189,7 @@ class SmoothPath:
         return 0.0
 
     def speeds(self) -> Floats:
-        """Return upper bounds (n - 1,), in m/s, on the speed between successive samples.
+        """Return upper bounds (n - 1,), in m/s, on the speed between n successive samples.
 
         Between two samples, the velocity is a quadratic Bezier curve within the triangle of its
         control points. Two control points are the end velocities. The third is 3 times the mean
@@ -263,7 +266,7 @@ class FingerState:
     position, velocity: position (3,), m, and velocity (3,), m/s.
     path_time_s: time since the first point of the path; negative before the finger reaches it.
     path_done: whether the finger has reached the end of the path.
-    force: (3,) force of the sheet on the finger, N.
+    force: force (3,) of the sheet on the finger, N.
     """
 
     position: Floats

@@ -181,7 +181,7 @@ class TwinFingerNode(Node):
         return (at_ns - self.started_ns) * 1e-9
 
     def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
-        """Return the position (3,), m, and velocity (3,), m/s, of the finger without forces."""
+        """Return the position (3,), m, and velocity (3,), m/s, of the finger's voluntary motion."""
         state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
         return state.position, state.velocity
 

@@ -112,7 +112,10 @@ class ForceHistory:
 
 
 def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> Floats:
-    """Return forces (n,), N, with hysteresis and creep, for elastic forces (n,) at times (n,)."""
+    """Return the forces (n,), N, of rubber with hysteresis and creep.
+
+    times_s, elastic_n: times (n,) and elastic forces (n,) at these times.
+    """
     return np.array(
         [history.update(float(t), float(f)) for t, f in zip(times_s, elastic_n, strict=True)]
     )

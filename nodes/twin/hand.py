@@ -270,7 +270,7 @@ def _hermite(t: float, span_s: float, before: float, after: float, rates: list[f
 def _interpolate(curve: list[float], at: float) -> float:
     """Interpolate a curve linearly at a fractional index, and extrapolate beyond the curve's end.
 
-    Return 0 for an index below 0.
+    Returns 0 if the index is below 0.
     """
     if at <= 0.0:
         return 0.0

@@ -33,8 +33,8 @@ CELLS = 32
 """The number of intervals between nodes along each side of the sheet. An element spans two
 intervals."""
 MIN_CELL_FRACTION = 0.008
-"""The distance between nodes under the finger, divided by the length of the side. It is 1.9 mm for
-240 mm."""
+"""The distance between nodes under the finger, divided by the length of the sheet's side. If the
+side is 240 mm long, the distance is 1.9 mm."""
 
 SLACK_TENSION = 2e-4
 """The isotropic tension that is added everywhere, in units of the shear modulus. Without this
@@ -306,7 +306,7 @@ def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK
     """Return the elastic energy (...,) per volume at rest, J/m3, of a membrane that wrinkles.
 
     c: components [C11, C22, C12] (..., 3) of the right Cauchy-Green tensor.
-    shear_modulus: in Pa.
+    shear_modulus: shear modulus of the rubber, Pa.
     """
     large, small, _ = _eigen(c)
     stretched = np.maximum(large, 1.0)

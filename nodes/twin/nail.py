@@ -97,7 +97,7 @@ class Nail:
 
     @property
     def knuckle_shift_m(self) -> Floats:
-        """Return the displacement (3,), m, of the knuckle and the hand by the finger's tilt."""
+        """Return the displacement (3,), m, of knuckle and hand that the finger's tilt causes."""
         return np.asarray(FINGER_LENGTH_M * (self.direction - np.array(FINGER_DIRECTION)))
 
 

@@ -138,7 +138,10 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines to the surface over (along, arc), for 1.25 times the range of strokes."""
+        """Fit splines to the surface as functions of `along` and `arc`.
+
+        The splines cover 1.25 times the range of strokes.
+        """
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
             for half in (0.625 * size for size in self.touchable_m)
@@ -223,7 +226,7 @@ def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
 
 
 def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
-    """Return the times (n,), s, of a path after slowing it down to the finger's maximum speed.
+    """Return the times (n,), s, of a path that is slowed down to the finger's maximum speed.
 
     All times are multiplied by the same factor of at least 1.
 
@@ -246,7 +249,7 @@ def place_path(
     """Make a path in the scene from a smooth motion in surface positions.
 
     If the path with wander and tremor would leave the scene's finger volume, the motion is scaled
-    down. If it would exceed the scene's maximum finger speed, the motion is slowed down.
+    down. If the path would exceed the scene's maximum finger speed, the motion is slowed down.
 
     times_s, places: sample times (n,) and surface positions (n, 3), m.
 
