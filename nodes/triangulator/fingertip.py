@@ -222,7 +222,10 @@ def detect_all(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the window of each image that shows the gate; (None, None) if there is no window."""
+    """Return the window of each image that shows the gate.
+
+    Returns (None, None) if there is no gate, or if an image does not show the gate.
+    """
     if inputs.gate is None:
         return None, None
     geometry, found = inputs.geometry, list[Window]()
@@ -284,7 +287,8 @@ def _match_blobs(
 ) -> list[BlobPair]:
     """Return all pairs of blobs with rays that meet in front of the cameras.
 
-    A pair outside the finger's working volume, or with wrong radii, receives a rejection reason.
+    A pair receives a rejection reason if its reprojection error is too large, if its radii are
+    wrong, or if it is outside the finger's working volume.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (

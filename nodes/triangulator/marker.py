@@ -37,7 +37,7 @@ the blob's surroundings."""
 
 SURROUND_RANK = 0.75
 """The quantile of the surrounding pixels that is used as the grey level of the surroundings. A high
-quantile is necessary if only one side of the marker is a bright finger."""
+quantile is necessary if the bright finger is on only one side of the marker."""
 
 SKIRT_FRACTION = 0.1
 """The fraction of the marker's height (its grey levels above its surroundings) below which the
@@ -47,7 +47,7 @@ MAX_REGIONS = 64
 """The maximum number of bright regions that are searched in an image, largest first."""
 
 WHITE_LEVEL = 250
-"""The grey level from which a pixel is white."""
+"""The minimum grey level of a white pixel."""
 
 WHITE_FRACTION = 0.2
 """The fraction of white pixels above which an image is overexposed."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 BUNDLE = b"#bundle\0"
 HEADER_BYTES = 16
-"""The size of the name and the time at the beginning of a bundle."""
+"""The size of the name and the time at the beginning of an OSC bundle."""
 
 FORMATS = {"i": ">i", "f": ">f", "h": ">q", "d": ">d"}
 WITHOUT_DATA = "TFNI"

@@ -20,8 +20,8 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
 
 RAY_THRESHOLD_M = 7e-4
-"""The maximum root mean square distance of the marks from their rays. A calibrated camera causes a
-standard deviation of 0.12 mm per axis, and a calibrated projector 0.03 mm."""
+"""The maximum root mean square distance of the marks from their rays. The standard deviation per
+axis is 0.12 mm for a calibrated camera, and 0.03 mm for a calibrated projector."""
 
 SURFACE_THRESHOLD_M = 1.2e-3
 """The maximum mean distance of the marks from the sheet's surface: about five standard deviations.

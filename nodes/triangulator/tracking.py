@@ -20,7 +20,7 @@ GateResult = Literal["ok", "too_fast", "unconfirmed"]
 
 ok: the point was added to the track.
 too_fast: the point is farther away than a finger can move.
-unconfirmed: the point may start a new track, or the point arrived late."""
+unconfirmed: the point can start a new track if later points confirm it, or it arrived late."""
 
 PREDICTION_STEP_S = 0.01
 """The time between two points of the predicted path: a tenth of the period of a 10 Hz tremor."""

@@ -19,7 +19,8 @@ TruePath = Callable[[float], Floats]
 """A function that returns the true fingertip position (3,), m, in the world at a given time (s)."""
 
 MARKER_NOISE_PX = 0.01
-"""The standard deviation of a marker's centre at half a metre (from `flexsheet chart marker`)."""
+"""The standard deviation of a marker's centre if the marker is half a metre away. The command
+`flexsheet chart marker` determines this value."""
 
 HORIZON_MS = "horizon_ms"
 """The key for the prediction horizon of a benchmark case."""

@@ -20,8 +20,8 @@ from flexsheet.nodes.models import camera, rigid
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
-"""The minimum determinant of the distortion's Jacobian. Near zero, the lens model is not
-invertible."""
+"""The minimum determinant of the distortion's Jacobian. If the determinant is near zero, the lens
+model is not invertible."""
 
 MIN_SINE = 1e-6
 """The sine of the angle between two rays below which the rays are treated as parallel."""

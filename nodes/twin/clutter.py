@@ -246,7 +246,8 @@ PASSING = Clutter(
         ),
     ),
 )  # fmt: skip
-"""Moving clutter: a bead as bright as the marker, reflections, and cables before the finger."""
+"""Moving clutter: a bead as bright as the marker, reflections of lamps, and cables in front of the
+finger."""
 
 CLUTTER = {
     "none": Clutter(),

@@ -25,7 +25,7 @@ radius. A pixel with a larger deviation contains a mixture of colours and is ign
 
 AGREES_M = 0.002
 """The maximum difference (m) between the positions that blue and the phase encode. A pixel with a
-larger difference is ignored. One step of blue is 1.2 mm."""
+larger difference is ignored. One step of the blue level corresponds to 1.2 mm."""
 
 RIM_PX = 3
 """The width of the ignored outline of the object, px. In the outline, a mixture with black would

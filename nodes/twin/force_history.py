@@ -48,8 +48,8 @@ force."""
 class ForceHistory:
     """The state of the hysteresis and creep of one force of the sheet.
 
-    hysteresis_ratio: lost fraction of the loading energy in a cycle from zero force, including the
-        loss by creep.
+    hysteresis_ratio: fraction of the loading energy that is lost in a cycle from zero force. It
+        includes the loss by creep.
     creep_ratio_per_decade: relative decrease of the force per decade of time.
     """
 

@@ -140,7 +140,7 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """A function that extrapolates linearly the last two poses of the sheet's edges."""
+    """The last two poses of the sheet's edges, which are extrapolated linearly."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []

@@ -52,8 +52,8 @@ MAX_ITERATIONS = 80
 
 UNDAMPED_ROUNDS = 6
 """The number of equilibria in one finger step after which the changes of the friction forces are
-halved. They are halved again after each further equal number. Without this damping, the changes
-could alternate."""
+halved. Each time this number of further equilibria is solved, the changes are halved again. Without
+this damping, the changes could alternate."""
 
 MAX_FRICTION_ROUNDS = 30
 """The maximum number of equilibria that are solved per finger step while nodes slip."""

@@ -219,7 +219,7 @@ def _surface_map_of(scene: Scene) -> SurfaceMap:
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
-    """Return whether all world points (n, 3) lie in the scene's finger volume with a margin (m)."""
+    """Return whether all world points (n, 3) are at least `margin_m` inside the finger volume."""
     low = scene.finger.volume_min_m + margin_m
     high = scene.finger.volume_max_m - margin_m
     return bool((points >= low).all() and (points <= high).all())
@@ -282,10 +282,11 @@ def place_path(
 
 
 def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
-    """Load a recorded fingertip path, and map it to the scene's object. Its label is the file name.
+    """Load a recorded fingertip path, and map the path to the scene's object.
 
-    The file has the columns t_s, x_mm, y_mm and z_mm, with y upwards, as hand trackers write them.
-    The mapping preserves the motion and changes its location:
+    The label of the path is the file name. The file has the columns t_s, x_mm, y_mm and z_mm, with
+    y upwards, as hand trackers write them. The mapping preserves the motion and changes its
+    location:
 
     1. Rotate: the recorded x, y, z become the world's x, y, z (right, up, towards the user).
     2. Scale, if necessary, by one factor. Then the central 90 % of each coordinate fit the

@@ -146,7 +146,7 @@ class SheetPull:
 
         The flanges are not rotated.
 
-        time_s: time of the poses; it must not decrease.
+        time_s: time of the poses, which must not decrease between calls.
         """
         left_m = (world_from_left_flange @ left_flange_from_edge)[:3, 3]
         right_m = (world_from_right_flange @ right_flange_from_edge)[:3, 3]

@@ -130,9 +130,10 @@ def compute_reaction(
     """
 
     def push_n(stretch: float, across: float, along: float) -> Floats:
-        """Return the normal forces (n,), N, of a push at all depths.
+        """Return the normal forces (n,), N, of a push at all n depths.
 
-        across, along: position, as fractions of the sheet's width and height from its centre.
+        across, along: position relative to the sheet's centre, as fractions of the sheet's width
+            and height.
         """
         half_m = 0.5 * stretch * rubber.width_m
         edges = [transform(np.eye(3), [side * half_m, 0.0, 0.0]) for side in (-1.0, 1.0)]

@@ -31,7 +31,7 @@ LEANS = np.array([0.35, 0.7, 1.0])
 sag is 0."""
 
 STRETCH_MARGIN = 0.005
-"""The extension of the sag table beyond the scene's range of stretch ratios at both ends."""
+"""The amount by which the sag table exceeds the scene's range of stretch ratios at both ends."""
 
 
 @dataclass(frozen=True, slots=True)
