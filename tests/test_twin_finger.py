@@ -216,7 +216,7 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,a,2,3\n", "line 3"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,nan,2,3\n", "line 3: a value is not finite"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n0,1,2,3\n", "line 3: t_s does not increase"),
-        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n", "a path needs at least two"),
+        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n", "give a path with at least two samples"),
     ],
 )
 def test_a_bad_recording_is_rejected(tmp_path: Path, scene: Scene, text: str, printed: str) -> None:

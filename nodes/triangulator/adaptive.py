@@ -2,8 +2,8 @@
 
 Each filter assumes one motion model: white noise in the acceleration or in the jerk, alone or with
 an oscillator. The prediction is the weighted sum of the filters' predictions. The weights minimise
-the mean square error of the sum at the prediction horizon, according to the covariance of the
-filters' errors in the last seconds. Weights may be negative, so the sum can represent motion
+the mean square error of the sum at the prediction horizon. They are computed from the covariance of
+the filters' errors in the last seconds. Weights can be negative, so the sum can represent motion
 spectra that no single model has.
 
 Sources: Bates and Granger, Operational Research Quarterly 20, 1969 (combination by the covariance
@@ -41,9 +41,9 @@ ACCELERATION_DECAY_PER_S = 6.0
 acceleration for long."""
 
 MAX_OSCILLATOR_WIDTH_HZ = 2.0
-"""The maximum half-power bandwidth of an oscillator, which covers the spectral peak of a tremor and
-drifts of its frequency. Slow oscillators model voluntary motion around one point, with a damping
-ratio of one half."""
+"""The maximum half-power bandwidth of an oscillator. It covers the spectral peak of a tremor, and
+changes of the tremor's frequency. Slow oscillators model voluntary motion around one point, with a
+damping ratio of one half."""
 
 SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
 """The prediction horizons (s) at which the prediction errors are measured to compute the weights.
@@ -72,23 +72,23 @@ OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
 """The time constant and the minimum number of points for averaging an outdated error covariance."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
-"""The weight (in points) and the value of the initial variance of prediction errors. The unit is m
-instead of m^2, because errors are divided by the square root of their magnitude."""
+"""The weight (in points) and the value of the initial variance of prediction errors. The variance
+has the unit m, because each error (m) is divided by the square root of its magnitude."""
 
 MIN_ERROR_M = 1e-9
 """A constant that is added to the magnitude of errors to avoid a division by zero."""
 
 SHRINKAGE = 0.02
 """The regularisation of the weights towards equal weights, as a fraction of the mean square
-difference between the predictions. The covariance of the errors is known from a few seconds
-only."""
+difference between the predictions. It is necessary because the covariance of the errors is
+estimated from only a few seconds."""
 
 COMBINE_EVERY_POINTS = 4
 """The number of points after which the weights are computed again."""
 
 MIN_GAIN = 0.1
-"""The minimum gain of the filtered position. The gain is computed from the mean square innovation,
-which has a relative error of about 0.1."""
+"""The minimum ratio of the prediction's variance to the variance of a measured point. The gain of
+the filtered position is computed from this ratio, whose error is about 0.1."""
 
 START_POINTS = 32
 """The number of points at the start of a track for which the Kalman gains vary with time. Later
@@ -105,10 +105,12 @@ INTERVAL_RATIO, NOISE_RATIO = 1.08, 1.5
 are computed and cached."""
 
 TIME_STEP_S = 1e-5
-"""The time resolution of cached state transitions: a finger at 0.1 m/s moves by 1 um."""
+"""The time resolution of cached state transitions. A finger at 0.1 m/s moves by 1 um in this
+time."""
 
 MAX_CORRELATION = 0.3
-"""The correlation of the measurement noise between two axes above which the axes are rotated."""
+"""The maximum correlation of the measurement noise between two axes. If it is larger, the axes are
+rotated so that their noise is uncorrelated."""
 
 
 NO_OSCILLATOR = (10.0, 0.0)
@@ -275,7 +277,7 @@ def _find_observation(steps: int) -> Floats:
 def _find_rows(horizons: bytes) -> Floats:
     """Return the matrix (n, models * 5) that predicts positions at n horizons from weighted states.
 
-    horizons: bytes of a float64 array (n,) of horizons, s. The cache requires hashable arguments.
+    horizons: float64 array (n,) of horizons, s, as bytes, which the cache can hash.
     """
     rows = [OBSERVED @ compute_transition(float(time)) for time in np.frombuffer(horizons)]
     return np.array(rows).reshape(len(rows), -1)
@@ -285,11 +287,11 @@ def _find_rows(horizons: bytes) -> Floats:
 def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
     """Return factors (scored horizons + 1, n, 1) that interpolate predictions to n horizons.
 
-    horizons: bytes of a float64 array (n,) of horizons, s. The cache requires hashable arguments.
+    horizons: float64 array (n,) of horizons, s, as bytes, which the cache can hash.
     ages_ms: age, ms, for which the weights of each scored horizon were computed.
 
-    The last factor applies to the correction by the filtered position, and decreases from one at
-    the horizon zero to zero at the first age.
+    The last factor is the weight of the correction that the filtered position adds to the
+    predictions. It decreases from 1 at the horizon 0 to 0 at the first age.
     """
     times_ms = 1e3 * np.frombuffer(horizons)
     anchors_ms, counts = np.unique(ages_ms, return_counts=True)
@@ -319,20 +321,21 @@ def combine(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class BankEstimate(Estimate):
-    """An estimate of the filter bank: states (models, 5, 3) at one time, and adapted weights.
+    """The estimate of a filter bank at one time: the states (models, 5, 3), and their weights.
 
     covariance: noise covariance (3, 3), m^2, of the newest measured point in the world frame.
     axes: axes of the states as columns (3, 3) in the world frame. The measurement noise is
         uncorrelated along these axes.
     points: number of points since the start of the track.
-    past_ns, past: earlier times and states, oldest first, for the longest scored horizon.
+    past_ns, past: times and states of earlier estimates, oldest first. They cover the longest
+        scored horizon.
     error_covariance: covariance (scored horizons, 3, models, models), m, of the models' prediction
         errors by axis, divided by the square root of the errors' magnitude.
-    weights: weights (scored horizons, 3, models) with the sum 1 over the models.
+    weights: weights (scored horizons, 3, models), whose sum over the models is 1.
     recent: recent mean square errors (scored horizons, 3, models + 1), m^2, of each model and of
         the weighted sum.
-    scored_ages_ms: ages of the predictions that were compared with the newest point.
-    innovation: mean square (3,), m^2, of the combined innovation.
+    scored_ages_ms: ages (ms) of the predictions that were compared with the newest point.
+    innovation: mean square error (3,), m^2, of the weighted prediction of the next point.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
     velocity_variance: error variance (3,), m^2/s^2, of the velocity along the axes.
     """
@@ -486,7 +489,7 @@ def _prediction_errors(
 ) -> tuple[Floats, tuple[int, ...]]:
     """Return the errors of earlier predictions for a newly measured point.
 
-    times_ns, states: times and earlier states, oldest first.
+    times_ns, states: times and states of earlier estimates, oldest first.
     at_ns, point: time and position (3,) m of the new point, along the axes of the states.
     innovations: errors (models, 3), m, of the predictions from the newest state.
 
@@ -513,7 +516,7 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
 
     covariance: noise covariance (3, 3), m^2, of the new point.
 
-    Returns the estimate and the noise variances (3,), m^2, along its axes.
+    Returns the rotated estimate, and the noise variances (3,), m^2, along the rotated axes.
     """
     noise = estimate.axes.T @ covariance @ estimate.axes
     variances = np.diagonal(noise)

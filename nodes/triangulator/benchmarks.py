@@ -31,9 +31,9 @@ MARKER_CASES = (
     *((radius_px, 1.0, 0.0, 3.0) for radius_px in (1.6, 3.2, 6.0)),
 )
 """The benchmarked cases: radius (px), noise (multiple of the sensor's noise), motion during the
-exposure (px) and background gradient (levels per px). The radii correspond to 3 mm at 1, 0.5 and
-0.27 m. At 1 m/s, the motion is 4 px in 4 ms. A finger that is lit from the side has a gradient of 2
-or 3 levels per px."""
+exposure (px) and background gradient (levels per px). A marker with a radius of 3 mm has these
+radii in the image at 1, 0.5 and 0.27 m. A finger at 1 m/s moves by 4 px in 4 ms. A finger that is
+lit from the side has a gradient of 2 or 3 levels per px."""
 
 
 @dataclass(frozen=True, slots=True)

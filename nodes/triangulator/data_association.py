@@ -26,16 +26,17 @@ from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
 """The status of a track that is not the finger's track.
 
-tentative: the marker may be the finger, and may start the finger's track.
-ambiguous: the marker may be the finger or clutter, and must not start the finger's track yet.
+tentative: the marker is possibly the finger's marker, and can start the finger's track.
+ambiguous: it is uncertain whether the marker is the finger's marker, so it cannot start the
+    finger's track yet.
 clutter: the marker is not the finger."""
 
 POSITION_SIGMA_M = 0.0005
-"""The constant part of the scale (per axis) of a marker's deviation from motion at constant
-velocity."""
+"""The scale (per axis) of a marker's deviation from motion at constant velocity, immediately after
+a detection. The scale increases with time."""
 
 ACCELERATION_SIGMA_M_PER_S2 = 1.0
-"""The acceleration of a marker, which increases its deviation from motion at constant velocity."""
+"""The acceleration by which a marker is assumed to deviate from motion at constant velocity."""
 
 STUDENT_T_DOF = 2.0
 """The degrees of freedom of Student's t distribution for a marker's deviation from motion at
@@ -48,16 +49,16 @@ MAX_POSITION_SIGMA_M = 0.1
 """The upper bound of the predicted position error of a track."""
 
 MIN_APPEARANCE_SIGMA = np.array([0.01, 0.02])
-"""The minimum relative standard deviations of the grey levels of one marker and of its
-surroundings, from image to image."""
+"""The minimum relative standard deviations with which the grey levels of a marker and of its
+surroundings vary from image to image."""
 
 INITIAL_APPEARANCE_SIGMA = np.array([0.04, 0.08])
 """The initial relative standard deviations of the grey levels of a new track's marker and of its
 surroundings."""
 
 POPULATION_APPEARANCE_SIGMA = np.array([0.2, 0.4])
-"""The relative standard deviations of the grey levels between different markers, and between their
-surroundings."""
+"""The relative standard deviations with which the grey levels vary between different markers, and
+between their surroundings."""
 
 APPEARANCE_TIME_CONSTANT_S = 0.2
 """The time constant for averaging the appearance (grey levels) of a marker."""
@@ -74,21 +75,22 @@ INFEASIBLE_COST = 1e9
 """The cost of assigning a marker to a track to which the marker cannot belong."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The cost difference below which two assignments are ambiguous: the square of three standard
+"""The cost difference below which two assignments are ambiguous. It is the square of three standard
 deviations."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0
-"""The maximum squared appearance distance at which two detections may show the same marker, in
+"""The maximum squared appearance distance at which two detections can show the same marker, in
 squared standard deviations."""
 
 VELOCITY_TIME_CONSTANT_S = 0.05
 """The time constant of the low-pass filter for a clutter track's velocity."""
 
 CLUTTER_SEARCH_PERIOD_S = 0.1
-"""The period of the search of the full images while the finger is tracked."""
+"""The period at which the full images are searched for clutter while the finger is tracked."""
 
 LATE_GATE_M = 0.03
-"""The maximum distance between the finger's newest position and its marker in a late image pair."""
+"""The maximum distance from the newest position of the finger at which its marker is accepted in an
+image pair that arrives late."""
 
 STATIONARY_RADIUS_M = 3e-4
 """The radius within which a stationary marker stays. A finger always moves more."""
@@ -108,18 +110,19 @@ TENTATIVE_TRACK_TIMEOUT_S = 0.1
 MIN_HITS detections."""
 
 SOLE_CANDIDATE_TIME_S = 1.0
-"""The time after which the only visible marker is assigned to the finger, even if it is
-ambiguous."""
+"""The time after which the only visible marker is assigned to the finger, even if the status of its
+track is `ambiguous`."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""The time since the finger's loss after which moving clutter may be selected as the finger."""
+"""The time since the finger's loss after which moving clutter can be selected as the finger."""
 
 
 @dataclass(slots=True)
 class Track:
-    """A track of a marker: position (3,) m, velocity (3,) m/s, and appearance (2,) with variance.
+    """The position (3,) m, velocity (3,) m/s and appearance (2,) of a tracked marker.
 
-    The appearance is the logarithm of the grey levels of the marker and of its surroundings.
+    The appearance contains the logarithms of the grey levels of the marker and of its surroundings.
+    Its variance is estimated too.
     """
 
     point: Floats
@@ -213,8 +216,8 @@ class ClutterTrack(Track):
     def is_alive(self, at_ns: int) -> bool:
         """Return whether the track still exists at the time `at_ns`.
 
-        A track ends if the last detection is too old, or in the future (after a change of the
-        clock).
+        A track ends if its last detection is too old. It also ends if its last detection is in the
+        future because the clock was set back.
         """
         timeout_s = TRACK_TIMEOUT_S
         if self.is_stationary and self.status == "clutter":
@@ -238,7 +241,8 @@ class DataAssociation:
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
         """Select the finger's marker among the detections of an image pair, and update the tracker.
 
-        Returns "ok" or the reason why no finger was found, and the triangulated marker.
+        The first result is "ok", or the reason why no finger was found. The second result is the
+        triangulated marker, or None if nothing was triangulated.
         """
         if tracker.is_late(at_ns):
             return self._associate_late(at_ns, detection, tracker)
@@ -258,7 +262,8 @@ class DataAssociation:
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
         """Select the finger in an image pair that is older than the newest image pair.
 
-        The selection uses the distance from the finger only, because past clutter is not stored.
+        Markers are selected only by their distance from the finger, because past clutter is not
+        stored.
         """
         markers = detection.markers
         if len(markers) > 1 and self._finger is not None:
@@ -475,7 +480,7 @@ def assign_columns(costs: Floats) -> list[int]:
 
 
 def _ambiguous_rows(costs: Floats, columns: Sequence[int], finger: int) -> set[int]:
-    """Return the rows of the markers that may be either the finger or clutter.
+    """Return the rows of the markers that could be either the finger or clutter.
 
     costs: cost of assigning each marker (row) to each track (column).
     columns: column of the track that is assigned to each marker.

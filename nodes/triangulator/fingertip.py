@@ -40,31 +40,31 @@ from flexsheet.nodes.triangulator.triangulation import (
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
-"""The standard deviation of the logarithm of a blob's size ratio: its radius / expected radius."""
+"""The standard deviation of the logarithm of a blob's size ratio. The size ratio is the radius of
+the blob divided by the expected radius."""
 
 HEIGHT_SIGMA = 0.25
-"""The standard deviation of the logarithm of a brightness ratio: the marker's brightness in the
-left view divided by its brightness in the right view."""
+"""The standard deviation of the logarithm of a brightness ratio. The ratio is the brightness of a
+marker in the left view divided by its brightness in the right view."""
 
 MISFIT_SIGMA_PX = 0.5
-"""The standard deviation of the distance between the two rays of an unrefined marker, projected
-into the images."""
+"""The standard deviation of a marker's reprojection error before its centres are refined."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""The maximum absolute logarithm of a blob's size ratio. The radius is then 0.55 to 1.8 times the
+"""The maximum absolute logarithm of a blob's size ratio. It permits radii of 0.55 to 1.8 times the
 expected radius."""
 
 SIZE_SIGMAS = 3.5
 """The maximum deviation of a refined marker's radius from the expected radius, in standard
-deviations. If the deviation is larger, the marker is partly occluded or merged with a bright spot.
-"""
+deviations. A larger deviation means that the marker is partly occluded, or merged with a bright
+spot."""
 
 MARKER_SIZE_SIGMA = 0.035
 """The relative standard deviation of the radii of manufactured markers."""
 
 STEREO_SIZE_SIGMAS = 4.5
-"""The maximum difference of a marker's radius between both views, in standard deviations. If the
-difference is larger, the marker is partly occluded in one view."""
+"""The maximum difference of a marker's radius between both views, in standard deviations. A larger
+difference means that the marker is partly occluded in one view."""
 
 MAX_MOTION_DIFFERENCE_PX = 2.5
 """The maximum difference between both views in a marker's motion during the exposure."""
@@ -79,8 +79,8 @@ MAX_FLAT_PAIRS = 4
 """The maximum number of blob pairs that are refined as flat markers."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The cost difference between the best and the second best pair below which the marker is
-ambiguous, in squared standard deviations."""
+"""The minimum cost difference between the best and the second best pair, in squared standard
+deviations. If the difference is smaller, the marker is ambiguous."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,8 @@ class BlobPair:
         gate.
     cost: sum of the squared deviations of rays, sizes, brightness and distance from the gate's
         centre, in squared standard deviations.
-    rejection_reason: None if the pair may be a marker in the finger's working volume.
+    rejection_reason: reason why the pair cannot be a marker in the finger's working volume; None if
+        it can be one.
     """
 
     left: Blob
@@ -148,8 +149,8 @@ class StereoDetection:
     """The markers that were detected in an image pair.
 
     reason: "ok", or the reason why the finger was not found.
-    measured: triangulated point of the finger's marker or of a rejected marker; None if no two rays
-        meet.
+    measured: triangulated point of the finger's marker or of a rejected marker; None if no point
+        was triangulated.
     markers: candidates inside the gate, sorted by cost.
     clutter: candidates outside the gate.
     """
@@ -221,7 +222,10 @@ def detect_all(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the window of each image that shows the gate; (None, None) if there is no window."""
+    """Return the window of each image that shows the gate.
+
+    Returns (None, None) if there is no gate, or if an image does not show the gate.
+    """
     if inputs.gate is None:
         return None, None
     geometry, found = inputs.geometry, list[Window]()
@@ -283,7 +287,8 @@ def _match_blobs(
 ) -> list[BlobPair]:
     """Return all pairs of blobs with rays that meet in front of the cameras.
 
-    A pair outside the finger's working volume, or with wrong radii, receives a rejection reason.
+    A pair receives a rejection reason if its reprojection error is too large, if its radii are
+    wrong, or if it is outside the finger's working volume.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
@@ -397,7 +402,7 @@ def _check_flat_pair(
 
     Returns both markers with corrected centres, and with the major semi-axis as radius. Returns
     None if the ellipses do not show one flat marker. The mismatch of the shapes is added to the
-    covariance, because an obstacle changes the semi-axis and the centre by the same amount.
+    covariance, because an obstacle in front of a marker shifts its centre by a similar amount.
     """
     measured = _triangulate(inputs, markers)
     if measured is None:
@@ -440,10 +445,10 @@ def _flat_pose(
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the markers of refined pairs, sorted by cost, and drop pairs of two different markers.
+    """Return the markers of refined pairs, sorted by cost.
 
-    A pair is dropped if both blobs belong to pairs with lower costs, or if one blob belongs to a
-    pair with a much lower cost.
+    A pair is dropped if its blobs probably show two different markers: both blobs belong to pairs
+    with lower costs, or one blob belongs to a pair with a much lower cost.
     """
     unique: list[RefinedPair] = []
     for one in sorted(
@@ -530,7 +535,10 @@ def _inside(volume: tuple[Floats, Floats], point_world: Floats) -> bool:
 def _triangulate(
     inputs: DetectionInput, markers: tuple[Marker, Marker]
 ) -> TriangulatedPoint | None:
-    """Triangulate a marker from its refined images in both views; None if the rays do not meet."""
+    """Triangulate a marker from its refined centres in both views.
+
+    Returns None if the rays through the centres do not meet.
+    """
     noise_px, occlusion = inputs.config.noise_px, _occlusion_variance_px2(markers) * np.eye(2)
     left, right = (
         (marker.covariance if noise_px is None else noise_px**2 * np.eye(2)) + occlusion
@@ -546,7 +554,7 @@ def _triangulate(
 
 
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
-    """Estimate the variance (px^2) of a marker's centre that partial occlusion causes.
+    """Estimate the variance (px^2) that partial occlusion adds to the centre of a marker.
 
     An obstacle that covers a strip of a disc shifts the centre and reduces the radius by half the
     strip's width. The variance is therefore the squared difference of the radii in both views,
@@ -562,7 +570,7 @@ def _validate(
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
     """Check the reprojection error, standard deviation and position of a triangulated point.
 
-    Returns "ok" or the reason to reject the point, and the point itself.
+    The first result is "ok", or the reason to reject the point. The second result is the point.
     """
     config = inputs.config
     if (

@@ -32,12 +32,12 @@ NEIGHBOURHOOD_PX = 31
 """The side of the square around a pixel whose mean grey level is the threshold for this pixel."""
 
 SURROUND_PX = 3
-"""The width of the border around a blob. The outermost pixels determine the grey level of the
-blob's surroundings."""
+"""The width of the border around a blob. The border's outermost pixels determine the grey level of
+the blob's surroundings."""
 
 SURROUND_RANK = 0.75
 """The quantile of the surrounding pixels that is used as the grey level of the surroundings. A high
-quantile is necessary if only one side of the marker is a bright finger."""
+quantile is necessary if the bright finger is on only one side of the marker."""
 
 SKIRT_FRACTION = 0.1
 """The fraction of the marker's height (its grey levels above its surroundings) below which the
@@ -47,7 +47,7 @@ MAX_REGIONS = 64
 """The maximum number of bright regions that are searched in an image, largest first."""
 
 WHITE_LEVEL = 250
-"""The grey level from which a pixel is white."""
+"""The minimum grey level of a white pixel."""
 
 WHITE_FRACTION = 0.2
 """The fraction of white pixels above which an image is overexposed."""
@@ -106,12 +106,13 @@ MarkerRejection = Literal["merged", "blurred"]
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A marker in an image, refined to subpixel accuracy: centre (2,) px, covariance (2, 2) px^2.
+    """A marker in an image, refined to subpixel accuracy.
 
+    centre, covariance: centre (2,), px, and its covariance (2, 2), px^2.
     radius: radius of the disc, or mean semi-axis of the ellipse, px.
     radius_deviation: standard deviation of the estimated radius, as a fraction of the radius.
     blur: standard deviation of the edge blur, px.
-    motion: displacement (x, y) during the exposure, px; its sign is unknown.
+    motion: displacement (x, y) during the exposure, px. Its sign cannot be determined.
     elongation: vector (e, f), px, for a flat marker that is seen at an angle; see the module
         `ellipse`.
     height: difference of grey levels between the marker and its surroundings.
@@ -130,7 +131,8 @@ class Marker:
 
 
 Refine = Callable[[Sequence[Image], Sequence[Blob], PixelNoise], list[Marker]]
-"""A function that refines blobs to markers, from one image per blob."""
+"""A function that refines blobs to markers. It receives one image per blob, the blobs, and the
+noise of the pixels."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
@@ -186,7 +188,10 @@ def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = 
 
 
 def _count_pixels(outline: cv2.typing.MatLike) -> float:
-    """Return the number of pixels inside and on an outline of pixel centres (Pick's theorem)."""
+    """Return the number of pixels inside and on an outline between pixel centres.
+
+    The number follows from Pick's theorem.
+    """
     return cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
 
 
@@ -311,10 +316,12 @@ class SystematicError:
 
 
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
-"""The systematic error of the method `moments`, from simulations (`tests/test_marker.py`)."""
+"""The systematic error of the method `moments`, as measured in simulations
+(`tests/test_marker.py`)."""
 
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""The systematic error of the method `subpixel_fit`, from simulations (`tests/test_marker.py`)."""
+"""The systematic error of the method `subpixel_fit`, as measured in simulations
+(`tests/test_marker.py`)."""
 
 
 def moments(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
@@ -369,8 +376,8 @@ def _make_marker(
     """Make a marker from the result of a fit.
 
     motion: motion (x, y) during the exposure, px, which increases the systematic error.
-    is_blurred, is_merged: whether to reject the marker as out of focus, or as merged with another
-        spot.
+    is_blurred: whether to reject the marker because it is out of focus.
+    is_merged: whether to reject the marker because it is merged with another spot.
     """
     rejection_reason: MarkerRejection | None = "blurred" if is_blurred else None
     return Marker(
@@ -426,5 +433,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""The refinement of flat markers for each method. A method that has no entry detects round markers
-only."""
+"""The function that refines flat markers, for each refinement method. A method that has no entry
+detects only round markers."""

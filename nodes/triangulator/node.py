@@ -49,11 +49,11 @@ from flexsheet.nodes.triangulator.triangulation import (
 )
 
 TIMEOUT_PERIODS = 2.5
-"""The minimum timeout of a track, in frame periods, so that one image pair may be missing."""
+"""The minimum timeout of a track, in frame periods. A track survives one missing image pair."""
 
 
 SAME_POINT_M = 0.001
-"""The maximum distance between the positions of a marker from two searches of an image pair."""
+"""The maximum distance between two points of an image pair that are treated as the same marker."""
 
 
 class Triangulator(Node):

@@ -31,7 +31,7 @@ from flexsheet.nodes.triangulator.external_fingertip import ExternalFingertip
 from flexsheet.nodes.triangulator.osc_packet import read_packet
 
 MAX_PACKET_BYTES = 2048
-"""The maximum size of a packet, which also bounds the nesting of bundles."""
+"""The maximum size of a packet. It also limits how deeply OSC bundles can be nested."""
 
 POSITION, POSE = 3, 7
 """The numbers of values in a position message, and in a pose message (position and quaternion)."""
@@ -45,7 +45,7 @@ IDENTITY: tuple[Row, Row, Row] = (
 
 
 class OscStream(LimitedModel):
-    """An OSC address with positions, and the transform of the positions to the world frame."""
+    """The OSC address of a stream of positions, and their transform to the world frame."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 BUNDLE = b"#bundle\0"
 HEADER_BYTES = 16
-"""The size of the name and the time at the beginning of a bundle."""
+"""The size of the name and the time at the beginning of an OSC bundle."""
 
 FORMATS = {"i": ">i", "f": ">f", "h": ">q", "d": ">d"}
 WITHOUT_DATA = "TFNI"
@@ -26,7 +26,7 @@ def read_packet(data: bytes) -> Iterator[tuple[str, list[float]]]:
         (size,) = struct.unpack_from(">i", data, offset)
         end = offset + 4 + size
         if size <= 0 or end > len(data):
-            raise ValueError(f"OSC bundle of {len(data)} bytes: an element states {size} bytes")
+            raise ValueError(f"OSC bundle of {len(data)} bytes: an element size is {size} bytes")
         yield from read_packet(data[offset + 4 : end])
         offset = end
 

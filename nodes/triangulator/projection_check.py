@@ -1,10 +1,10 @@
 """Compare the positions of projected marks on the sheet with their expected positions.
 
-A mark is on the ray of its projector pixel for any position of the sheet. The distance from this
-ray therefore indicates errors of the projector and the camera. The distance from the expected
-surface of the sheet indicates errors of the arms and the camera. Near a finger that pushes the
-sheet, the surface moves by a known fraction of the pad's motion. There the marks indicate errors of
-the pad's depth.
+Wherever the sheet is, a projected mark is on the ray of its projector pixel. The distance of a mark
+from this ray therefore indicates errors of the projector and the camera. The distance of a mark
+from the expected surface of the sheet indicates errors of the arms and the camera. Near a finger
+that pushes the sheet, the sheet moves by a known fraction of the finger's motion. Marks near the
+finger therefore indicate errors of the finger's depth.
 """
 
 from __future__ import annotations
@@ -20,45 +20,48 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
 
 RAY_THRESHOLD_M = 7e-4
-"""The maximum root mean square distance of the marks from their rays. A calibrated camera causes a
-standard deviation of 0.12 mm per axis, and a calibrated projector 0.03 mm."""
+"""The maximum root mean square distance of the marks from their rays. The standard deviation per
+axis is 0.12 mm for a calibrated camera, and 0.03 mm for a calibrated projector."""
 
 SURFACE_THRESHOLD_M = 1.2e-3
 """The maximum mean distance of the marks from the sheet's surface: about five standard deviations.
-The camera contributes 0.12 mm. Per arm, base and clamp contribute 0.2 mm, and joint zero positions
-0.2 mm (docs/apparatus.md)."""
+The camera contributes 0.12 mm. Each arm contributes 0.2 mm by its base and clamp, and 0.2 mm by the
+zero positions of its joints (docs/apparatus.md)."""
 
 FINGER_THRESHOLD_M = 2e-3
-"""The maximum error of the finger's depth in the sheet. The marker's offset contributes a standard
-deviation of 0.3 mm, the camera 0.12 mm, the arms 0.25 mm, and noise 0.2 mm."""
+"""The maximum error of the finger's depth in the sheet. The standard deviations of its causes are
+0.3 mm (marker's offset), 0.12 mm (camera), 0.25 mm (arms) and 0.2 mm (noise)."""
 
 LATENCY_THRESHOLD_S = 0.01
 """The maximum deviation of the display latency from its configured value: ten standard deviations
 of a measurement by photodiode (1 ms)."""
 
 LATENCY_MEMORY_S = 4.0
-"""The time constant for averaging the latency. Only images that show the previous frame contain
-information, and these images are rare."""
+"""The time constant for averaging the latency. It is long because the latency can be measured only
+in the few camera images that still show the previous frame."""
 
 MATCH_RADIUS_M = 0.012
 """The maximum distance between a detected point and the expected position of its mark."""
 
 MAX_SPREAD_M = 0.004
-"""The maximum difference between the offset of a mark and the median offset of all marks."""
+"""The maximum difference between the offset of a mark from its expected position and the median
+offset of all marks."""
 
 MAX_AGE_NS = 300_000_000
 """The maximum age of the newest displayed frame at the exposure of an image pair."""
 
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
-"""The speed of the marks below which positions are checked, and above which latency is checked."""
+"""The speed of the marks below which their positions are checked, and the speed above which the
+latency is checked."""
 
 MAX_DRIFT_M = 3e-4
-"""The maximum motion of a mark along the sheet's normal between frame and exposure. If a mark moves
-more, its height above the sheet is not checked."""
+"""The maximum motion of a mark along the sheet's normal between the display of a frame and the
+exposure of an image. If any mark moves more, no height above the sheet is checked."""
 
 MAX_GAIN = 4.0
-"""The maximum ratio of the standard deviations of the finger's estimated depth and a mark's height.
-If the ratio is larger, the marks are too far from the finger, and the depth is not estimated."""
+"""The maximum standard deviation of the finger's estimated depth, as a multiple of the standard
+deviation of a mark's height. If the multiple is larger, the marks are too far from the finger, and
+the depth is not estimated."""
 
 
 class ProjectionCheck:
@@ -97,8 +100,8 @@ class ProjectionCheck:
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
         """Compare the bright points (3,), m, of an image pair with the expected marks.
 
-        camera_shift_m: displacement (3,) of the fixed reference marks that an error of the camera's
-            pose causes.
+        camera_shift_m: displacement (3,) by which an error of the camera's pose shifts the measured
+            positions of the fixed reference marks.
         at_ns: time of the image pair.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
@@ -142,11 +145,11 @@ class ProjectionCheck:
             self._latency.add(np.array([late]), at_ns)
 
     def _velocities(self, number: int) -> Floats | None:
-        """Return the velocities (n, 3), m/s, of the marks in a frame; NaN for marks off the sheet.
+        """Return the velocities (n, 3), m/s, of the n marks in a frame.
 
         number: index of the frame in `_frames`.
 
-        Returns None if no velocity is known.
+        The velocity is NaN if a mark is not on the sheet. Returns None if no velocity is known.
         """
         if number == 0:
             return None
@@ -203,7 +206,7 @@ class ProjectionCheck:
 def make_check(
     cause: SuspectedCause, monitor: ResidualMonitor, *, suspected: bool | None = None
 ) -> SelfCheck:
-    """Make the result of a self-check from the monitor of a residual.
+    """Make the result of a self-check from the monitor of its residual.
 
     suspected: whether the cause is suspected; None if the monitor decides.
     """

@@ -30,7 +30,8 @@ MARK_THRESHOLD_M = 6e-4
 
 MARKER_THRESHOLD_M = 1.5e-3
 """The maximum distance of a resting finger from the known point: more than four standard
-deviations. The marker offset contributes 0.3 mm per axis, the camera 0.12 mm, and noise 0.1 mm."""
+deviations. The standard deviations per axis of the causes are 0.3 mm (marker's offset), 0.12 mm
+(camera) and 0.1 mm (noise)."""
 
 MARK_RADIUS_M = 0.008
 """The maximum distance between a detected point and its reference mark."""
@@ -51,8 +52,8 @@ class CameraCheck:
     reference_marks: world positions (n, 3), m, of fixed marks that look like the finger's marker.
     touch_point: world position (3,), m, of a known point that the finger can touch; None if no
         point is known.
-    projector: projector of the scene, which may project check marks on the sheet; None if there is
-        none.
+    projector: projector of the scene, which may project check marks on the sheet; None if the scene
+        has no projector.
     """
 
     def __init__(
@@ -101,7 +102,8 @@ class CameraCheck:
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
         """Remove the fixed marks and the projected marks from a detection.
 
-        tracked: whether the finger was searched in a gate. Markers inside the gate then remain.
+        tracked: whether the finger was searched for in a gate. If so, no marker inside the gate is
+            removed.
         """
         marks = np.concatenate([self._marks, self._projection.expected_world_m])
         if not len(marks):

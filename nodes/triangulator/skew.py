@@ -24,8 +24,9 @@ def compensate_skew(
 
     The corrected point is the finger's position at the mean time of both exposures. To first order,
     a finger with velocity v is measured with the error M v, where M = s (A_r J_r - I/2). Here s is
-    the skew, J_r the Jacobian of the right pixel, and A_r the derivative of the triangulated point
-    with respect to the right pixel. The uncertainty of v is added to the covariance.
+    `skew_s`, I is the identity matrix, and J_r is the derivative of the right pixel with respect to
+    the point. A_r is the derivative of the triangulated point with respect to the right pixel. The
+    uncertainty of v is added to the covariance.
     """
     world = geometry.world_from_left[:3, :3]
     in_left, in_right = geometry.transform_to_cameras(measured.point_world)

@@ -46,14 +46,14 @@ otherwise 0."""
 
 WHITE = 255
 MARGIN_PX = 3.0
-"""The width of the surroundings of a disc at rest that the fit uses. The finger's edge, where the
+"""The width of the border that the fit uses around a disc at rest. The finger's edge, where the
 background is not linear, is farther away."""
 
 MIN_MARGIN_PX = 1.25
-"""The minimum width of the surroundings of a moving disc that the fit uses."""
+"""The minimum width of the border that the fit uses around a moving disc."""
 
 MARGIN_PER_MOTION = 0.5
-"""The reduction of the width of a disc's surroundings, as a fraction of the disc's motion during
+"""The reduction of the width of the border around a disc, as a fraction of the disc's motion during
 the exposure."""
 
 PRIOR_WEIGHTS = np.array(
@@ -76,7 +76,7 @@ START_ELONGATION = 0.45
 """The maximum ratio of an ellipse's elongation to its radius in the starting values of the fit."""
 
 ELLIPSE_BLUR_PX = 0.8
-"""The starting value for the blur of an ellipse, which the spread of a blob does not reveal."""
+"""The starting value for the blur of an ellipse. The spread of a blob does not determine it."""
 
 MOTION_STEP_PX = 1.8
 """The maximum distance between the positions over which the image of a moving disc is averaged."""
@@ -110,6 +110,9 @@ class PixelNoise:
     """The noise of an image sensor.
 
     The variance of a grey level L is read_levels^2 + L / photons_per_level.
+
+    read_levels: standard deviation of the read noise, grey levels.
+    photons_per_level: number of photons that one grey level represents.
     """
 
     read_levels: float = 1.5
@@ -191,8 +194,8 @@ def fit_ellipses(
 ) -> list[DiscFit]:
     """Fit one ellipse without motion blur in each image (height, width).
 
-    starts: starting values of moving discs. Each ellipse starts with the second moments of its
-        disc.
+    starts: starting values of moving discs. Each ellipse starts with the second moments of the
+        corresponding moving disc.
 
     The ellipses are fitted one by one, because the computing time increases with the third power of
     the largest ellipse's size.
@@ -235,8 +238,8 @@ class DiscSolution:
     """The result of the Gauss-Newton iteration for n discs in cut-outs of s x s pixels.
 
     found: parameters (n, parameters) after the last step.
-    residuals: differences (n, s s) between image and model before the last step.
-    weights: inverse noise variances (n, s s) of the pixels; zero for excluded pixels.
+    residuals: differences (n, s * s) between image and model before the last step.
+    weights: inverse noise variances (n, s * s) of the pixels; zero for excluded pixels.
     information: Fisher information plus prior (n, parameters, parameters).
     gains: first-order reduction (n, parameters) of the weighted squared residuals by the last step
         of each parameter.
@@ -313,11 +316,11 @@ def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]
 class DiscCutouts:
     """Cut-outs (s x s pixels) of n images around the starting centres of discs.
 
-    corners: column and row of each cut-out's first pixel, which is the origin of its coordinates.
-    offsets: starting centres in these coordinates.
-    levels, weights: grey levels (n, s s) of the pixels, and inverses of their noise variances.
-    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
-    white: whether a pixel is saturated, (n, s s); None if no pixel is saturated.
+    corners: column and row of the first pixel of each cut-out in its image.
+    offsets: starting centres of the discs, relative to the first pixels of their cut-outs.
+    levels, weights: grey levels (n, s * s) of the pixels, and inverses of their noise variances.
+    x, y: coordinates of the pixels in a cut-out, as arrays (1, 1, s) and (1, s, 1).
+    white: array (n, s * s), True if a pixel is saturated; None if no pixel is saturated.
     """
 
     corners: list[tuple[int, int]]
@@ -332,7 +335,7 @@ class DiscCutouts:
 def _cut_out_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> DiscCutouts:
-    """Cut out the pixels around each disc; the weights of pixels outside the image are zero."""
+    """Cut out the pixels around each disc. The weights of pixels outside the image are zero."""
     lengths = [math.hypot(*one.motion) for one in starts]
     reaches = [
         one.radius + max(MARGIN_PX - MARGIN_PER_MOTION * length, MIN_MARGIN_PX)
@@ -385,11 +388,12 @@ def _cut_out_discs(
 
 
 def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the grey levels (n, s s) of n discs in s x s pixels, and derivatives (n, parameters, s
-    s).
+    """Return the grey levels (n, s * s) of n discs in s x s pixels, and their derivatives.
+
+    The derivatives have the shape (n, parameters, s * s).
 
     found: parameters (n, parameters) of the discs.
-    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
+    x, y: coordinates of the pixels, as arrays (1, 1, s) and (1, s, 1).
 
     A moving (motion-blurred) disc is averaged over k positions, in arrays (n, k, s, s).
     """
@@ -435,12 +439,12 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the grey levels (n, s s) of n ellipses in s x s pixels, and their derivatives.
+    """Return the grey levels (n, s * s) of n ellipses in s x s pixels, and their derivatives.
 
-    The derivatives have the shape (n, parameters, s s).
+    The derivatives have the shape (n, parameters, s * s).
 
     found: parameters (n, parameters) of the ellipses.
-    x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
+    x, y: coordinates of the pixels, as arrays (1, 1, s) and (1, s, 1).
     """
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)

@@ -20,7 +20,7 @@ GateResult = Literal["ok", "too_fast", "unconfirmed"]
 
 ok: the point was added to the track.
 too_fast: the point is farther away than a finger can move.
-unconfirmed: the point may start a new track, or the point arrived late."""
+unconfirmed: the point can start a new track if later points confirm it, or it arrived late."""
 
 PREDICTION_STEP_S = 0.01
 """The time between two points of the predicted path: a tenth of the period of a 10 Hz tremor."""
@@ -79,14 +79,14 @@ class Gate:
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Return whether a measured point, with its noise, can be inside the gate."""
+        """Return whether a measured point can be inside the gate, given its noise."""
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
 
 @dataclass(frozen=True, slots=True)
 class TrackPrediction:
-    """The predicted state of the tracked point at one time, and its predicted path (n, 3), m.
+    """The predicted state of the tracked point at one time, and n points (n, 3), m, of its path.
 
     covariance: joint covariance (6, 6) of position (3,), m, and velocity (3,), m/s.
     """
@@ -112,7 +112,7 @@ class Tracker:
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return the newest estimate, even if the track is lost; None before the first point."""
+        """Return the newest estimate, even if the track is lost, or None before the first point."""
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
@@ -120,7 +120,10 @@ class Tracker:
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
-        """Return the state of the track at `at_ns`, which must not be before its newest point."""
+        """Return the state of the track at a time.
+
+        at_ns: time that is not before the newest point of the track.
+        """
         if not self._is_alive(at_ns):
             return "acquiring" if self._tentative_track else "lost"
         assert self.estimate is not None
@@ -150,8 +153,9 @@ class Tracker:
         )
 
     def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
-        """Predict position, velocity and path at the time `at_ns`, not before the newest point.
+        """Predict position, velocity and path at the time `at_ns`.
 
+        at_ns: time that is not before the newest point of the track.
         horizons_s: times (n,) of the path's points after `at_ns`; the first time must be 0.
 
         If the track is lost, the predicted path stays at the last position.
@@ -250,7 +254,9 @@ class Tracker:
     def _extend_tentative_track(
         self, measurement: PositionMeasurement, unconfirmed_result: GateResult
     ) -> GateResult:
-        """Add a point to the tentative track, which replaces the track when it is long enough.
+        """Add a point to the tentative track.
+
+        If the tentative track is long enough, it replaces the track.
 
         unconfirmed_result: result while the tentative track is too short.
         """
@@ -280,8 +286,9 @@ class Tracker:
     def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
         """Insert a late point into the history, and filter all later points again.
 
-        Several consecutive late points restart the track, because the clock was then set back.
-        Other late points are dropped if no point is missing at their time, or if they do not fit.
+        If several consecutive points are late, they restart the track, because the clock was
+        probably set back. A single late point is dropped if no point is missing at its time, or if
+        a finger cannot move through this point.
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:

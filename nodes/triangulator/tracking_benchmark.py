@@ -19,18 +19,21 @@ TruePath = Callable[[float], Floats]
 """A function that returns the true fingertip position (3,), m, in the world at a given time (s)."""
 
 MARKER_NOISE_PX = 0.01
-"""The standard deviation of a marker's centre at half a metre (from `flexsheet chart marker`)."""
+"""The standard deviation of a marker's centre if the marker is half a metre away. The command
+`flexsheet chart marker` determines this value."""
 
 HORIZON_MS = "horizon_ms"
 """The key for the prediction horizon of a benchmark case."""
 
 HORIZONS_S = (0.0, 0.02, 0.05)
-"""The prediction horizons: the exposure itself, the display of the frame, and the arms' motion."""
+"""The times (s) from the exposure to the predicted position. They stand for the exposure itself,
+the display of the frame, and the motion of the arms."""
 
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
-"""The maximum ratio of a path's speed to the scene's speed. The ratio permits tremor."""
+"""The maximum ratio of a path's speed to the scene's maximum finger speed. It is above 1 because
+tremor increases the speed."""
 WITHOUT_VELOCITY = ("none",)
 """The methods that do not estimate the velocity, and so cannot predict a moving finger."""
 
@@ -62,8 +65,8 @@ class MeasuredPath:
     times_ns: times (n,).
     points: measured points (n, 3), m.
     covariances: covariances (n, 3, 3), m^2.
-
-    truth: true points (n, 3), m, at the predicted times, for each prediction horizon.
+    truth: true points (n, 3), m, for each prediction horizon (s). Each of these points is the true
+        position one horizon after a measurement.
     """
 
     times_ns: NDArray[np.int64]
@@ -162,7 +165,7 @@ def _trial(
 ) -> Trial:
     """Make a trial that measures the error of predictions and the time of one update.
 
-    Predictions in the first WARM_UP_S are ignored.
+    Predictions in the first WARM_UP_S seconds are ignored.
     """
     filter_ = TRACKING_METHODS[method](scene.finger.max_speed_m_per_s)
     middle = len(seen.times_ns) // 2

@@ -20,8 +20,8 @@ from flexsheet.nodes.models import camera, rigid
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
-"""The minimum determinant of the distortion's Jacobian. Near zero, the lens model is not
-invertible."""
+"""The minimum determinant of the distortion's Jacobian. If the determinant is near zero, the lens
+model is not invertible."""
 
 MIN_SINE = 1e-6
 """The sine of the angle between two rays below which the rays are treated as parallel."""
@@ -32,7 +32,10 @@ MAX_DISTANCE_M = 1e4
 
 @dataclass(frozen=True, slots=True)
 class StereoGeometry:
-    """The geometry of a stereo camera: camera matrices 3x3, distortions (5,), transforms 4x4."""
+    """The geometry of a stereo camera.
+
+    It consists of camera matrices (3, 3), lens distortions (5,) and transforms (4, 4).
+    """
 
     device: str
     width_px: int
@@ -83,7 +86,9 @@ class StereoGeometry:
         return project_with_jacobian(point, self.matrices[view], self.distortions[view])
 
     def undistort(self, view: int, pixel: Floats) -> tuple[float, float] | None:
-        """Return the undistorted normalized coordinates of a pixel (2,), or None if it is invalid.
+        """Return the undistorted normalized coordinates of a pixel (2,).
+
+        Returns None if the pixel is invalid for the lens model.
 
         view: 0 for the left camera, 1 for the right camera.
         """
@@ -116,7 +121,7 @@ class ImageMismatchError(FlexsheetError, ValueError):
     """An error for images that cannot come from the scene's camera."""
 
     code = "image-mismatch"
-    remedy = "Set the camera in the scene to the one that took the images."
+    remedy = "Change the camera in the scene to the camera that took the images."
 
 
 def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
@@ -189,8 +194,8 @@ class ClosestApproach:
 def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
     """Triangulate points by the direct linear transform (homogeneous linear least squares).
 
-    left, right: undistorted normalized coordinates (n, 2).
-    right_from_left: transform (4, 4).
+    left, right: undistorted normalized coordinates (n, 2) in both views.
+    right_from_left: transform (4, 4) from the left to the right camera's frame.
 
     Returns points (n, 3), m, in the left camera's frame.
 
@@ -210,7 +215,8 @@ def project_with_jacobian(
 ) -> tuple[Floats, Floats]:
     """Return the pixel (2,) of a point (3,), m, in the camera's frame, and its Jacobian.
 
-    The Jacobian is (2, 3), px/m. Python numbers are ten times as fast as arrays with two elements.
+    The Jacobian (2, 3) is in px/m. The function computes with Python numbers, which are ten times
+    as fast as arrays with two elements.
     """
     px, py, pz = point.tolist()
     fx, fy, cx, cy = _intrinsics(matrix)

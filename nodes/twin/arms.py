@@ -69,7 +69,7 @@ independent of the noise of measured joint angles."""
 
 
 def check_loopback(address: str) -> str:
-    """Raise ValueError unless a network address is a loopback address; return the address.
+    """Return a network address if it is a loopback address; otherwise raise ValueError.
 
     The simulated arms accept commands from any client without authentication.
     """
@@ -187,7 +187,7 @@ RV_1A_MECHANICS = ArmMechanics(RV_1A)
 
 @dataclass(frozen=True, slots=True)
 class PlacedArm:
-    """An arm with the poses (4, 4) of its base and of its clamped edge of the sheet."""
+    """An arm, and the poses (4, 4) of its base and of the sheet's edge that it clamps."""
 
     mechanics: ArmMechanics
     world_from_base: Floats
@@ -208,7 +208,9 @@ class PlacedArm:
     def solve_joints(self, world_from_edge: Floats, guess_rad: Floats) -> Floats:
         """Return the joint angles (6,), rad, for a pose (4, 4) of the edge.
 
-        guess_rad: initial joint angles (6,). Raises ValueError if the pose is out of reach.
+        guess_rad: initial joint angles (6,).
+
+        Raises ValueError if the pose is out of reach.
         """
         flange = inverse(self.world_from_base) @ world_from_edge @ inverse(self.flange_from_edge)
         return self.mechanics.solve_inverse_kinematics(flange, guess_rad)
@@ -236,9 +238,9 @@ class Servo:
     """The six joint servos of an arm. Each servo is a second-order system with critical damping.
 
     joints_rad: joint angles (6,) that the encoders at the motors measure.
-    lag_s: lag of a joint behind a set-point of constant velocity.
-    driven_rad: joint angles (6,) at the output of the gears. After a reversal, they are constant
-        until the motor has moved by `backlash_rad`.
+    lag_s: time by which a joint lags behind a set-point that moves at constant velocity.
+    driven_rad: joint angles (6,) at the output of the gears. After a motor reverses, its joint does
+        not move until the motor has moved by `backlash_rad`.
     """
 
     joints_rad: Floats
@@ -254,8 +256,8 @@ class Servo:
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
         """Simulate the servos for `duration_s`, in steps of at most a millisecond.
 
-        wanted_rad: set-point (6,), rad. braking: whether to brake along the path instead of
-        following the set-point.
+        wanted_rad: set-point (6,), rad.
+        braking: whether to brake along the path instead of following the set-point.
         """
         if braking and not self.velocity_rad_per_s.any():
             return
@@ -281,15 +283,15 @@ class Servo:
 class Controller:
     """A simulated controller of one arm that checks command blocks and answers with its status.
 
-    The controller refuses a command with an invalid magic number, version, CRC, mode or sequence
-        number by a Modbus exception. Four faults make the arm brake: joint angles out of range,
-        joint angles that are not finite, a jump of the set-point, and no command for `watchdog_s`
-        while the arm moves. A command with the mode `idle` clears a fault and may restart the
-        sequence numbers.
+    If a command has an invalid magic number, version, CRC, mode or sequence number, the controller
+    refuses it and answers with a Modbus exception. Four faults make the arm brake: joint angles out
+    of range, joint angles that are not finite, a jump of the set-point, and no command for
+    `watchdog_s` while the arm moves. A command with the mode `idle` clears a fault, and can restart
+    the sequence numbers.
 
     noise_rad: standard deviation of the measured joint angles.
-    cycle_s: period of the controller. A set-point takes effect when the next cycle begins. If it is
-        0, set-points take effect immediately.
+    cycle_s: period of the controller. A set-point takes effect when the next cycle begins. If the
+        period is 0, set-points take effect immediately.
     cycle_jitter_s: standard deviation of the start of a cycle.
     latency_s: time from the arrival of a set-point until it is ready for the next cycle.
     """
@@ -330,7 +332,10 @@ class Controller:
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Simulate the motion for `duration_s`; brake if no command has arrived in time."""
+        """Simulate the motion for `duration_s`.
+
+        The arm brakes if no command has arrived in time.
+        """
         end_s = self._time_s + duration_s
         while self._pending and self._pending[0][0] <= end_s:
             due_s, wanted_rad = self._pending.popleft()
@@ -457,7 +462,10 @@ class ArmServer:
 
     @property
     def port(self) -> int:
-        """Return the network port of the server; for port 0, the system chooses a free port."""
+        """Return the network port of the server.
+
+        If the configured port is 0, the system chooses a free port.
+        """
         listener: Any = None if self._server is None else self._server.transport
         if listener is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")

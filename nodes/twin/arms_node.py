@@ -59,8 +59,8 @@ class TwinArmsParameters(SimulatorParameters):
     protocol: Literal["modbus", "mxt"] = "modbus"
     cycle_s: NonNegative = Field(
         default=0.0,
-        description="Modbus: period of the controller cycles, at whose start set-points take "
-        "effect, s; 0: set-points take effect at once",
+        description="Modbus: period of the controller, s. Set-points take effect at the start of "
+        "a period; 0: set-points take effect immediately",
     )
     restart_after_s: Positive = Field(
         default=2.0,
@@ -79,9 +79,9 @@ class TwinArmsParameters(SimulatorParameters):
 
 
 def open_joints_file(path: str | None) -> dict[str, Floats]:
-    """Map a file that stores the joint angles (rad) of both arms to arrays.
+    """Open a file that stores the joint angles (rad) of both arms, as memory-mapped arrays.
 
-    Return one array (6,) per side. The arrays contain NaN if the file is new or `path` is None.
+    Returns one array (6,) per side. The arrays contain NaN if the file is new or `path` is None.
     Raises OSError if the file cannot be opened.
     """
     if path is None:
@@ -99,7 +99,8 @@ def joint_torques_nm(
 ) -> Floats:
     """Return the joint torques (6,), N m, that a force on the sheet's edge causes in an arm.
 
-    joints_rad: joint angles (6,). flange_from_edge: pose (4, 4) of the edge in the flange frame.
+    joints_rad: joint angles (6,).
+    flange_from_edge: pose (4, 4) of the edge in the flange frame.
     force_n: force (3,) in the base frame.
     """
     step_rad = 1e-4
@@ -113,7 +114,10 @@ def joint_torques_nm(
 
 
 class TwinArmsNode(Node):
-    """A node that simulates both arms and the sheet between them, from the first scene onwards."""
+    """A node that simulates both arms and the sheet between them.
+
+    The simulation starts when the first scene arrives.
+    """
 
     role: ClassVar[NodeRole | None] = NodeRole.ARM_SIMULATOR
     opens_devices: ClassVar[bool] = True
@@ -210,7 +214,7 @@ class TwinArmsNode(Node):
     def _start_joints(self, side: str, scene: Scene) -> Floats:
         """Return the encoder angles (6,), rad, at which an arm starts.
 
-        There, the sheet lies in the screen plane (z = 0) with the scene's minimum stretch.
+        At these angles, the sheet is in the screen plane (z = 0) with the scene's minimum stretch.
         """
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
@@ -228,7 +232,7 @@ class TwinArmsNode(Node):
             self._stored_joints[side][:] = controller.servo.joints_rad
 
     def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
-        """Set the joint torques that the sheet's tension causes in the controllers.
+        """Pass to the controllers the joint torques that the sheet's tension causes.
 
         Only controllers with the protocol MXT report torques.
         """

@@ -40,11 +40,12 @@ MIN_CHARUCO_FRACTION = 0.6
 """The minimum fraction of the corners of a ChArUco board that must be visible in both images."""
 
 CHARUCO_NEARER = 1.2
-"""The ratio of the image size of a ChArUco board to that of a chessboard."""
+"""The factor by which a ChArUco board appears larger in the image than a chessboard. Only a part of
+a ChArUco board must be visible."""
 
 
 class BoardError(FlexsheetError, ValueError):
-    """Raised for a board that cannot be rendered."""
+    """An error for a board that cannot be rendered."""
 
     code = "board"
     exit_code = 2
@@ -55,8 +56,10 @@ class BoardError(FlexsheetError, ValueError):
 class Light:
     """The uneven illumination of an image, and the background behind the board.
 
-    gain: brightness factor at the image centre. slope_x, slope_y: relative change of the brightness
-    from the centre to the right and lower edges. background: grey levels (height, width).
+    gain: brightness factor at the image centre.
+    slope_x, slope_y: relative change of the brightness from the centre to the right and lower
+        edges.
+    background: grey levels (height, width).
     """
 
     gain: float
@@ -68,7 +71,8 @@ class Light:
 class TwinBoard:
     """A simulated stereo camera that views a calibration board.
 
-    camera: true lenses and poses. seed: determines noise, illumination and poses.
+    camera: true lenses and poses.
+    seed: random seed of the noise, the illumination and the poses.
     """
 
     def __init__(self, camera: StereoCamera, board: Board, *, seed: int) -> None:
@@ -233,7 +237,7 @@ class TwinBoard:
 
         The board appears at the centre, corners and edges of the image, at several distances, with
         tilts in all directions. It is as far from the image centre as possible while both images
-        show the whole board (most of a ChArUco board).
+        show the whole board, or most of a ChArUco board.
         """
         board = self.board
         board_centre = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
@@ -296,10 +300,10 @@ class TwinBoard:
 
 
 def _measure_rise(place: Singles) -> Singles:
-    """Return how much a board coordinate changes from one ray to the next ray of a row or column.
+    """Return the change of a board coordinate from one ray to the next ray of a row or column.
 
-    Each pixel has several rays. The change is computed for one of them, because it hardly varies
-    within a pixel.
+    Each pixel has several rays. The change is computed for only one ray per pixel, because it
+    hardly varies within a pixel.
 
     place: board coordinate (rows, columns) of each ray.
     """
@@ -311,7 +315,9 @@ def _measure_rise(place: Singles) -> Singles:
 
 
 def _markers(board: Board) -> NDArray[np.bool_]:
-    """Return whether each cell of the ChArUco markers is black, (rows + 1, columns + 1, n, n).
+    """Return an array (rows + 1, columns + 1, n, n) that is True where a marker's cell is black.
+
+    rows, columns: numbers of inner corners of the ChArUco board.
 
     A marker has n cells per side, including its black border. Markers are numbered by row over the
     white squares. The first square of the board is black, as in OpenCV. Raises BoardError if the
@@ -354,8 +360,8 @@ def _markers(board: Board) -> NDArray[np.bool_]:
 def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
     """Return an array (...) that is 1 where a marker is black and 0 elsewhere.
 
-    squares: board positions (..., 2) in units of squares. share: side length of a marker as a
-    fraction of its square.
+    squares: board positions (..., 2) in units of squares.
+    share: side length of a marker as a fraction of its square.
     """
     rows, columns, cells, _ = markers.shape
     column = np.clip(np.floor(squares[..., 0]).astype(np.intp), 0, columns - 1)

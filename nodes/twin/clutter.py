@@ -35,7 +35,7 @@ class Trajectory(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FixedPoint:
-    """A trajectory of an object that does not move."""
+    """The trajectory of an object that does not move."""
 
     point: Point
 
@@ -111,8 +111,8 @@ class Occluder:
 class Sheet:
     """An illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
 
-    contrast: standard deviation of the texture's grey levels. grain_m: size of the texture's
-    features.
+    contrast: standard deviation of the texture's grey levels.
+    grain_m: size of the texture's features.
     """
 
     half_width_m: float = 0.12
@@ -124,9 +124,9 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """A set of cluttering objects. They are drawn in the order of the fields.
+    """The clutter objects of a scene, which are drawn in the order of this class's fields.
 
-    The finger with its marker is drawn after `limbs`.
+    The finger and its marker are drawn after `limbs`.
     """
 
     sheet: Sheet | None = None
@@ -155,8 +155,9 @@ def touching_highlight(overlap: float) -> Clutter:
 def covered(share: float, *, views: Views = "both") -> Clutter:
     """Return clutter that consists of an occluder with a straight edge across the marker.
 
-    share: hidden fraction (0 to 1) of the marker, from the side +x. With 1, the blurred edge of the
-    marker is also hidden. views: cameras in which the marker is hidden.
+    share: hidden fraction (0 to 1) of the marker, from the side +x. If it is 1, the blurred edge of
+        the marker is also hidden.
+    views: cameras in which the marker is hidden.
     """
     radius_m = 0.05
     if share >= 1.0:
@@ -223,7 +224,7 @@ CLAMPS = Clutter(
         Highlight(FixedPoint((0.135, -0.04, 0.01)), 0.0008, 150.0),
     )
 )
-"""Reflections on the clamps of the sheet's edges."""
+"""Reflections on the clamps that hold the sheet's edges."""
 
 PASSING = Clutter(
     markers=(SecondMarker(Oscillation((0.0, 0.05, 0.02), (0.14, 0.02, 0.0), 7.3)),),
@@ -245,8 +246,8 @@ PASSING = Clutter(
         ),
     ),
 )  # fmt: skip
-"""Moving clutter: a bead as bright as the marker, reflections, and cables in front of the finger.
-"""
+"""Moving clutter: a bead as bright as the marker, reflections of lamps, and cables in front of the
+finger."""
 
 CLUTTER = {
     "none": Clutter(),

@@ -1,9 +1,9 @@
 """Measure the image error at each point of the object from position codes that are drawn on it.
 
-In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point encodes the x
-or y coordinate at which the eye should see the point on the imaginary screen (z = 0). Red and green
-are the cosine and the sine of a phase. Blue encodes the coarse position. The image error is the
-position at which the eye sees a point minus the encoded position.
+The eye should see each point of the object at certain coordinates on the imaginary screen (z = 0).
+The colours of the patterns `coordinate_ramp_x` and `coordinate_ramp_y` encode x and y. Red and
+green are the cosine and the sine of a phase. Blue encodes the coarse position. The image error is
+the position at which the eye sees a point minus the encoded position.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ radius. A pixel with a larger deviation contains a mixture of colours and is ign
 
 AGREES_M = 0.002
 """The maximum difference (m) between the positions that blue and the phase encode. A pixel with a
-larger difference is ignored. One step of blue is 1.2 mm."""
+larger difference is ignored. One step of the blue level corresponds to 1.2 mm."""
 
 RIM_PX = 3
-"""The width of the object's outline that is ignored, px. There, mixing with black would change the
-decoded position."""
+"""The width of the ignored outline of the object, px. In the outline, a mixture with black would
+change the decoded position."""
 
 COARSE_LIGHT = 0.1
-"""The fraction of the maximum blue below which a pixel does not belong to the object."""
+"""The fraction of the maximum blue level below which a pixel does not belong to the object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class ErrorMap:
 
     @property
     def sizes_m(self) -> Floats:
-        """Return the absolute errors (n,) of all decoded points."""
+        """Return the absolute errors (n,), m, of all n decoded points."""
         sizes = np.linalg.norm(self.errors_m, axis=2)
         return np.asarray(sizes[np.isfinite(sizes)])
 
@@ -77,7 +77,10 @@ def _lit(picture: Image) -> Bools:
 
 
 def _places(picture: Image) -> tuple[Floats, Bools]:
-    """Return the position (m) that each pixel encodes, and its validity, both (rows, columns)."""
+    """Return the position (m) that each pixel encodes, and a mask of valid positions.
+
+    Both arrays have the shape (rows, columns).
+    """
     red, green, blue = np.moveaxis(picture.astype(np.float64) / 127.5 - 1.0, -1, 0)
     phase = np.arctan2(green, red) / (2.0 * np.pi)
     coarse = ((0.5 * (blue + 1.0) - 0.2) / 0.8 - 0.5) * RANGE_M

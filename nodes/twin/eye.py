@@ -45,10 +45,8 @@ FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
 Flat-shaded images need more samples, because sizes are measured at their outlines."""
 
 SHADOW_TOLERANCE = 0.002
-"""The minimum distance of a shadowed point behind the first surface on its projector ray.
-
-The distance is relative to the distance of the point from the projector.
-"""
+"""The minimum distance of a shadowed point behind the surface that shadows it, as a fraction of the
+point's distance from the projector."""
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
@@ -57,7 +55,7 @@ GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0,
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """Raised if an image does not show the whole object that must be measured."""
+    """An error for an image that does not show the whole object that must be measured."""
 
     code = "not-measurable"
     remedy = "Choose a pose in which the whole object is visible within the image."
@@ -78,7 +76,7 @@ class Rays:
     height: int
 
     def directions(self) -> Floats:
-        """Return the directions (height, width, 3) of all rays; they are not unit vectors."""
+        """Return the directions (height, width, 3) of all rays, which are not unit vectors."""
         columns, rows = np.arange(self.width), np.arange(self.height)
         return self.first + columns[None, :, None] * self.right + rows[:, None, None] * self.down
 
@@ -87,7 +85,7 @@ class Rays:
 class Hits:
     """The first intersection of each ray through an image with a mesh.
 
-    triangle (height, width): index of the triangle that the ray hits; -1 if it hits none.
+    triangle (height, width): index of the triangle that the ray hits; -1 if there is no hit.
     inverse_range (height, width): reciprocal of the ray parameter at the hit; 0 if there is no hit.
     weights (triangles, 3, 3): matrices that map (1, column, row) to unnormalized barycentric
         weights.
@@ -148,7 +146,8 @@ class TrueProjector:
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """Compute the rays of a projector that illuminates a sheet.
 
-        vertices (v, 3): vertices of the sheet, world frame, m. triangles (t, 3): vertex indices.
+        vertices (v, 3): vertices of the sheet, world frame, m.
+        triangles (t, 3): vertex indices.
         """
         self._world_from_projector = pose_matrix(projector.world_from_projector)
         self._lens = lens = projector.lens
@@ -229,7 +228,7 @@ Box = tuple[int, int, int, int]
 
 
 def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
-    """Return the rays from the eye (3,) through the part `box` of its square image.
+    """Return the rays from the eye (3,) through the part `box` of the eye's square image.
 
     The whole image has `size` x `size` pixels. Each pixel has `samples` x `samples` rays. The first
     ray is at the top left.
@@ -258,7 +257,8 @@ def seen(
 ) -> Image:
     """Render the image (rows, columns, 3) that a camera at the eye takes of the sheet.
 
-    projected: projected image (height, width, 3). eye (3,): position, m.
+    projected: projected image (height, width, 3).
+    eye (3,): position, m.
 
     A pixel is black if its rays miss the sheet, or if a fold of the sheet blocks the light.
     """
@@ -290,7 +290,7 @@ def seen(
 def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | None:
     """Return the part of the eye's image that shows world points (n, 3), with a margin.
 
-    Return None if the image shows none of the points.
+    Returns None if the image shows none of the points.
     """
     if len(points) == 0:
         return None
@@ -406,14 +406,16 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return the first and the last row (px) of the object at a column. All three values can be
-        fractional.
+        """Return the first and the last row (px) of the object at a column.
+
+        All three values can be fractions of pixels.
         """
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Return the first and the last column (px) of the object at a row. All three values can be
-        fractional.
+        """Return the first and the last column (px) of the object at a row.
+
+        All three values can be fractions of pixels.
         """
         return self._ends_between(self._gray, row)
 
@@ -501,7 +503,7 @@ class EyeSituation:
     """The true state of the simulated hardware and of the object while a frame is shown.
 
     scene: scene with the true parameters of the devices.
-    finger_tip: position (3,) in the world frame, m, or None if there is no finger.
+    finger_tip: position (3,) of the fingertip in the world frame, m; None if there is no finger.
     skin: surface mesh of the soft body at rest, with v vertices.
     displacement: displacement (v, 3) of the skin, m. Skin and displacement are None if the object
         is not deformed.

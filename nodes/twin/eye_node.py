@@ -53,8 +53,8 @@ class TwinEyeParameters(SimulatorParameters):
     )
     eye_stale_s: Positive = Field(
         default=0.1,
-        description="maximum age of the tracked eye position, s; with an older one, the eyes of "
-        "the scene are used",
+        description="maximum age of the tracked eye position, s; if the position is older, the "
+        "eyes of the scene are used",
     )
     min_interval_s: Positive = Field(
         default=5.0, description="minimum time between two rendered frames of the same label, s"
@@ -70,14 +70,14 @@ class TwinEyeParameters(SimulatorParameters):
 class TwinEyeNode(Node):
     """A node that renders the eye's image of labelled frames.
 
-    An image takes about a second. Therefore the node renders one frame per label, correction method
-    and eye, and ignores further ones. Only frames that contain the pixels of a single view are
-    rendered. A mono frame is rendered from the viewpoint in the parameters, and a frame for one eye
-    from this eye.
+    An image takes about a second to render. Therefore the node renders one frame per label,
+    correction method and eye, and ignores further frames. It renders only frames that contain the
+    pixels of a single view. A mono frame is rendered from the viewpoint in the parameters. A frame
+    for one eye is rendered from the position of this eye.
 
-    The sheet has its shape at the time at which the projector shows the frame. This time is a few
-    milliseconds after the frame arrives. The finger position is taken from the latest exposure. The
-    deformation is the latest result of the soft-body solver.
+    The sheet is rendered as it is when the projector shows the frame, a few milliseconds after the
+    frame arrives. The finger position is taken from the latest exposure. The deformation is the
+    latest result of the soft-body solver.
     """
 
     on_demand: ClassVar[bool] = True
@@ -188,8 +188,8 @@ class TwinEyeNode(Node):
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
         """Return the true world position (3,), m, of the virtual camera at the time `at_s`.
 
-        The tracked eyes are used, or the scene's eyes if none are tracked. The offset in the
-        parameter `apparatus` is added.
+        The tracked eyes are used. If no eyes are tracked, the eyes in the scene are used. The
+        offset in the parameter `apparatus` is added.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

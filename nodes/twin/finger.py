@@ -33,7 +33,7 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """Raised for a path that the simulated finger cannot follow."""
+    """An error for a path that the simulated finger cannot follow."""
 
     code = "finger-path"
     remedy = "Slow the path down, or correct the point or line that the text names."
@@ -81,11 +81,11 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """Return the time (s, at most 0) at which the finger leaves the first point."""
+        """Return the time (s) at which the finger leaves the first point; it is at most 0."""
         ...
 
     def speeds(self) -> Floats:
-        """Return upper bounds (n - 1,), in m/s, on the speed between successive points."""
+        """Return upper bounds (n - 1,), in m/s, on the speed between n successive points."""
         ...
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
@@ -126,7 +126,10 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,), m/s, on the lines. The rounded motion is not faster."""
+        """Return the speeds (n - 1,), m/s, on the lines between n points.
+
+        The rounded motion is not faster.
+        """
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
@@ -186,7 +189,7 @@ class SmoothPath:
         return 0.0
 
     def speeds(self) -> Floats:
-        """Return upper bounds (n - 1,), in m/s, on the speed between successive samples.
+        """Return upper bounds (n - 1,), in m/s, on the speed between n successive samples.
 
         Between two samples, the velocity is a quadratic Bezier curve within the triangle of its
         control points. Two control points are the end velocities. The third is 3 times the mean
@@ -260,10 +263,10 @@ def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
 class FingerState:
     """The true state of the fingertip at one time.
 
-    position, velocity: (3,) in m and m/s.
+    position, velocity: position (3,), m, and velocity (3,), m/s.
     path_time_s: time since the first point of the path; negative before the finger reaches it.
     path_done: whether the finger has reached the end of the path.
-    force: (3,) force of the sheet on the finger, N.
+    force: force (3,) of the sheet on the finger, N.
     """
 
     position: Floats
@@ -282,8 +285,8 @@ class FingerMotion:
     ease_s: duration of the motion to the first point.
     amplitudes_before_m, amplitudes_m: amplitudes of wander and tremor before the path message and
         on the path. During the motion to the first point, they are interpolated.
-    age_s: time argument of wander and tremor when the path message arrived. Later motions continue
-        this time, so wander and tremor have no jumps.
+    age_s: time at which wander and tremor are evaluated when the path message arrives. It includes
+        the duration of earlier motions, so wander and tremor do not jump.
     """
 
     path: Path
@@ -384,8 +387,9 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return position (m) and velocity (m/s) without wander and tremor, and both amplitudes
-        (m).
+        """Return position (m) and velocity (m/s) without wander and tremor.
+
+        The third result contains the amplitudes (m) of wander and tremor.
         """
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
@@ -424,7 +428,8 @@ class FingerMotion:
 def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
     """Return the tremor amplitude (m) on a path.
 
-    A tremor in the true parameters `finger` replaces the tremor of a path, if the path has one.
+    If the path has a tremor and the true parameters `finger` contain a tremor, the tremor in the
+    true parameters is used.
     """
     if finger is None or finger.tremor_rms_m is None or not path_tremor_m:
         return path_tremor_m

@@ -46,7 +46,7 @@ class TwinFingerParameters(SimulatorParameters):
 
     seed: int = Field(
         default=2006,
-        description="random seed of the finger's unsteadiness and the image noise",
+        description="random seed of the finger's wander and tremor and of the image noise",
     )
     rest_world_m: tuple[float, float, float] = Field(
         default=(0.0, 0.0, 0.08),
@@ -63,13 +63,13 @@ class TwinFingerParameters(SimulatorParameters):
     hand: Literal["prescribed", "coupled"] = Field(
         default="prescribed",
         description="prescribed: the finger follows its path regardless of forces. coupled: the "
-        "force of the simulated sheet deflects the finger, by the hand impedance in the apparatus",
+        "force of the simulated sheet deflects the finger. The apparatus contains the hand's "
+        "impedance",
     )
     cache_dir: Path | None = Field(
         default=None,
-        description="folder that caches the table of the sheet's force on the finger of a "
-        "simulated hand that feels the sheet (coupled); null: "
-        "the user's cache folder",
+        description="folder that caches the table of the sheet's force on the finger, which is "
+        "used if the parameter `hand` is coupled; null: the user's cache folder",
     )
 
 
@@ -181,7 +181,7 @@ class TwinFingerNode(Node):
         return (at_ns - self.started_ns) * 1e-9
 
     def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
-        """Return position (m) and velocity (m/s) of the finger without forces, both (3,)."""
+        """Return the position (3,), m, and velocity (3,), m/s, of the finger's voluntary motion."""
         state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
         return state.position, state.velocity
 

@@ -25,30 +25,31 @@ REFERENCE_S = 1.0
 """The age (s) of a change of the force at which the relaxation function is one."""
 
 TIME_CONSTANTS_S = 10.0 ** np.arange(-1.0, 4.0)
-"""The time constants (s) of the relaxation function. With them, forces relax from about 50 ms to
-some hours."""
+"""The time constants (s) of the relaxation function. They cover ages from about 50 ms to some
+hours."""
 
 REVERSAL_RATIO = 0.1
-"""The relative change of the elastic force, after a reversal, in which the deviation of the
-hysteresis factor from its new value decreases to 1/e."""
+"""The relative change of the elastic force in which the hysteresis factor approaches its new value
+after a reversal. After this change, the remaining deviation is 1/e of the initial deviation."""
 
 MIN_FORCE_N = 1e-3
-"""The minimum elastic force (N) whose changes can reverse the hysteresis."""
+"""The elastic force (N) below which changes of the force do not affect the hysteresis."""
 
 CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
 """The fraction of the energy that a load cycle loses by creep, divided by the relative creep per
 decade."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""The time (s) in which the force of a push rises to the evaluated force, and the ratio of the
-maximum force to the evaluated force. The finger reverses at the maximum force."""
+"""The time (s) in which the elastic force of a push rises to the force at which the hysteresis is
+evaluated. The second value is the ratio of the maximum force, at which the finger reverses, to this
+force."""
 
 
 class ForceHistory:
     """The state of the hysteresis and creep of one force of the sheet.
 
-    hysteresis_ratio: lost fraction of the loading energy in a cycle from zero force, including the
-        loss by creep.
+    hysteresis_ratio: fraction of the loading energy that is lost in a cycle from zero force. It
+        includes the loss by creep.
     creep_ratio_per_decade: relative decrease of the force per decade of time.
     """
 
@@ -66,7 +67,7 @@ class ForceHistory:
         """Make the force history for the sheet of an apparatus (the true parameters of the
         hardware).
 
-        Return None if the sheet has neither hysteresis nor creep.
+        Returns None if the sheet has neither hysteresis nor creep.
         """
         if apparatus is None:
             return None
@@ -111,17 +112,20 @@ class ForceHistory:
 
 
 def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> Floats:
-    """Return forces (n,), N, with hysteresis and creep, for elastic forces (n,) at times (n,)."""
+    """Return the forces (n,), N, of rubber with hysteresis and creep.
+
+    times_s, elastic_n: times (n,) and elastic forces (n,) at these times.
+    """
     return np.array(
         [history.update(float(t), float(f)) for t, f in zip(times_s, elastic_n, strict=True)]
     )
 
 
 def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the ratios (2,) of the force of rubber to an elastic force, in loading and unloading.
+    """Return the ratios (2,) of the rubber's force to the elastic force, in loading and unloading.
 
-    The elastic force increases linearly to `TURNING_RATIO` times the evaluated force, and decreases
-    again.
+    The elastic force increases linearly to `TURNING_RATIO` times the force at which the ratios are
+    evaluated, and decreases again.
     """
     history = ForceHistory.of(apparatus)
     if history is None:

@@ -58,7 +58,7 @@ class TrueSheetForce:
     def compute_n(self, time_s: float, tip: Floats, left: Floats, right: Floats) -> float:
         """Return the normal force (N) of the sheet on a fingertip.
 
-        time_s: time; it must not decrease between calls.
+        time_s: time, which must not decrease between calls.
         tip (3,): position of the fingertip, m.
         left, right (4, 4): poses of the arms' flanges.
         """

@@ -20,7 +20,7 @@ The gestures follow published measurements of human motion:
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
     motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
 - Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411). Its amplitude is
-    0.03 mm with the hand at rest, 0.06 mm with the hand held out, and 0.12 to 0.15 mm with the arm
+    0.03 mm if the hand rests, 0.06 mm if the hand is held out, and 0.12 to 0.15 mm if the arm is
     held out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).
 - Most of the motion of a finger at rest has frequencies of 1-3.5 Hz and below (Carignan, Daneault
     and Duval 2009, Exp. Brain Res. 201:299). This motion is called wander in this package.
@@ -187,7 +187,8 @@ def _taps(
     In a tap, the finger moves from `lift_m` above the surface to PRESS_M below the surface, rests,
     and moves back. It does not brake before contact.
 
-    every_s: mean time between taps. contact_s: time below the surface in each tap.
+    every_s: mean time between taps.
+    contact_s: time below the surface in each tap.
     """
     generator = np.random.default_rng(seed)
     grid = np.linspace(0.0, 1.0, 1001)
@@ -276,7 +277,8 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 def _rounds(turns: int, turn_s: float) -> Sampled:
     """Sample the angle (n,), rad, of a rotation that starts and ends at rest.
 
-    turns: number of revolutions. turn_s: duration of one revolution.
+    turns: number of revolutions.
+    turn_s: duration of one revolution.
     """
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s

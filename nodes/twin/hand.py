@@ -57,7 +57,7 @@ UP = np.array([0.0, 1.0, 0.0])
 class HandImpedance:
     """The mechanical impedance of a hand at the fingertip, equal in all directions.
 
-    The default values describe a finger that moves together with the wrist. Their natural frequency
+    The default values describe a finger that moves together with the wrist. Its natural frequency
     without contact is 5 Hz (Lakie et al. 2015: 6 to 12 Hz with less mass).
     """
 
@@ -69,7 +69,7 @@ class HandImpedance:
     def of(cls, apparatus: Apparatus | None) -> Self:
         """Return the hand impedance from an apparatus (true parameters of the simulated hardware).
 
-        Return the default values if the apparatus contains no impedance.
+        Returns the default values if the apparatus contains no impedance.
         """
         finger = None if apparatus is None else apparatus.finger
         if finger is None or finger.hand_mass_kg is None:
@@ -99,9 +99,9 @@ class HandImpedance:
 class Touch:
     """The local state of the sheet below the finger at one time.
 
-    origin (3,): point of the unloaded sheet's tangent plane, m. normal (3,): its unit normal
-        towards the user.
-    curve_n (d,): normal forces at the depths in the force table `SheetReaction`.
+    origin (3,): point of the unloaded sheet's tangent plane, m.
+    normal (3,): its unit normal towards the user.
+    curve_n (d,): normal forces at the d depths in the force table `SheetReaction`.
     """
 
     origin: Floats
@@ -120,7 +120,8 @@ class TrueSheet:
     def find_touch(self, edges: tuple[Floats, Floats], tip: Floats) -> Touch:
         """Return the sheet's tangent plane and force curve at the point nearest to the fingertip.
 
-        edges: poses (4, 4) of the left and right edges. tip: world position (3,), m.
+        edges: poses (4, 4) of the left and right edges.
+        tip: world position (3,), m.
         """
         left, right = edges
         distance_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
@@ -139,7 +140,7 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """A linear extrapolation of the last two samples of the poses of the sheet's edges."""
+    """The last two poses of the sheet's edges, which are extrapolated linearly."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []
@@ -167,7 +168,7 @@ class EdgeTrack:
 
 
 class CoupledFinger:
-    """A simulation of the finger's deviation from its voluntary path by the force of the sheet.
+    """A simulation of how far the sheet's force moves a finger away from its voluntary path.
 
     path: voluntary motion; it may be replaced at any time.
     deviation_m, rate_m_per_s (3,): deviation and its rate of change.
@@ -186,8 +187,8 @@ class CoupledFinger:
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
         """Return a copy of this simulation, advanced to `time_s`.
 
-        If this simulation is more than MAX_PREDICTION_S behind `time_s`, it is advanced to this
-        limit.
+        If this simulation is more than MAX_PREDICTION_S behind `time_s`, it is first advanced
+        until it is MAX_PREDICTION_S behind.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)
@@ -203,8 +204,9 @@ class CoupledFinger:
         return position + self.deviation_m, velocity + self.rate_m_per_s
 
     def advance(self, until_s: float, edges: Edges) -> None:
-        """Integrate the motion until `until_s`. If the motion is already computed to this time, do
-        nothing.
+        """Integrate the motion until `until_s`.
+
+        If the motion is already computed to this time, nothing changes.
         """
         span_s = until_s - self.time_s
         if span_s <= 0.0:
@@ -268,7 +270,7 @@ def _hermite(t: float, span_s: float, before: float, after: float, rates: list[f
 def _interpolate(curve: list[float], at: float) -> float:
     """Interpolate a curve linearly at a fractional index, and extrapolate beyond the curve's end.
 
-    Return 0 for an index below 0.
+    Returns 0 if the index is below 0.
     """
     if at <= 0.0:
         return 0.0

@@ -59,8 +59,8 @@ class LitMarks:
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
         """Store the parameters of the simulated devices.
 
-        scene: scene with the true parameters of the devices. apparatus: deviations of the devices
-        from the scene that the nodes assume.
+        scene: scene with the true parameters of the devices.
+        apparatus: deviations of the devices from the scene that the nodes assume.
         """
         self._scene, self._apparatus = scene, apparatus
         self._world_from_projector = pose_matrix(require_projector(scene).world_from_projector)

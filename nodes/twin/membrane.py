@@ -2,9 +2,9 @@
 
 The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is W = mu/2
 (I1 - 3), where I1 is the first strain invariant and mu = E/3 is the shear modulus. A membrane has
-no bending stiffness. Under compression, it would buckle into infinitely fine wrinkles. There, the
-energy of a tension field is used instead of W (Pipkin, IMA J. Appl. Math. 36, 1986). The stress is
-uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. The relaxed energy
+no bending stiffness. Under compression, it would buckle into infinitely fine wrinkles. In wrinkled
+regions, the energy of a tension field replaces W (Pipkin, IMA J. Appl. Math. 36, 1986). The stress
+is uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. This energy
 is convex in the strain, so Newton's method with a line search finds its minimum.
 
 The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). The renderer uses other
@@ -33,16 +33,16 @@ CELLS = 32
 """The number of intervals between nodes along each side of the sheet. An element spans two
 intervals."""
 MIN_CELL_FRACTION = 0.008
-"""The distance between nodes under the finger, divided by the length of the side. It is 1.9 mm for
-240 mm."""
+"""The distance between nodes under the finger, divided by the length of the sheet's side. If the
+side is 240 mm long, the distance is 1.9 mm."""
 
 SLACK_TENSION = 2e-4
 """The isotropic tension that is added everywhere, in units of the shear modulus. Without this
 tension, the equilibrium of slack and wrinkled regions would not be unique."""
 
 CONTACT_PA_PER_M = 1e10
-"""The contact pressure per penetration depth, Pa/m. With it, a force of 10 N on 1 cm2 penetrates
-0.01 mm."""
+"""The contact pressure per penetration depth, Pa/m. At this value, a force of 10 N on 1 cm2
+penetrates by 0.01 mm."""
 
 MAX_STEP_RADII = 0.7
 """The maximum advance of the finger per step, in finger radii. A longer step could cross the
@@ -51,8 +51,9 @@ sheet."""
 MAX_ITERATIONS = 80
 
 UNDAMPED_ROUNDS = 6
-"""The number of equilibria in one finger step after which the applied changes of the friction
-forces are halved again. Without this damping, the changes may alternate."""
+"""The number of equilibria in one finger step after which the changes of the friction forces are
+halved. Each time this number of further equilibria is solved, the changes are halved again. Without
+this damping, the changes could alternate."""
 
 MAX_FRICTION_ROUNDS = 30
 """The maximum number of equilibria that are solved per finger step while nodes slip."""
@@ -64,7 +65,7 @@ GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """Raised if the iteration for the membrane's equilibrium does not converge."""
+    """An error that is raised if the iteration for the membrane's equilibrium does not converge."""
 
     code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
@@ -74,8 +75,8 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 class TrueRubber:
     """The dimensions and material of the simulated sheet at rest.
 
-    width_m: free length of the unstretched sheet between the clamps. height_m: length along the
-        clamps.
+    width_m: free length of the unstretched sheet between the clamps.
+    height_m: length along the clamps.
     density_kg_per_m3: density of the rubber; 0 if the weight is neglected.
     thickness_gradient: relative change of the thickness from the left to the right clamp, and from
         the lower to the upper end of the clamps.
@@ -291,9 +292,9 @@ class _Mesh:
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the larger and the smaller eigenvalue (...,) of C, and a unit eigenvector (..., 2).
 
-    The eigenvector belongs to the larger eigenvalue.
+    C is a symmetric 2x2 matrix. The eigenvector belongs to the larger eigenvalue.
 
-    c: components [C11, C22, C12] (..., 3).
+    c: components [C11, C22, C12] (..., 3) of C.
     """
     mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
     radius = np.hypot(half, c[..., 2])
@@ -304,7 +305,8 @@ def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
 def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION) -> Floats:
     """Return the elastic energy (...,) per volume at rest, J/m3, of a membrane that wrinkles.
 
-    c: components [C11, C22, C12] (..., 3) of the right Cauchy-Green tensor. shear_modulus: in Pa.
+    c: components [C11, C22, C12] (..., 3) of the right Cauchy-Green tensor.
+    shear_modulus: shear modulus of the rubber, Pa.
     """
     large, small, _ = _eigen(c)
     stretched = np.maximum(large, 1.0)
@@ -416,9 +418,9 @@ class _Finger:
     def release(self, positions: Floats, fraction: float) -> bool:
         """Let the nodes slip whose friction force exceeds the Coulomb limit.
 
-        Return whether forces changed; then a new equilibrium must be computed. The friction force
-        of a slipping node is the friction coefficient times the normal force. Its direction does
-        not change.
+        Returns whether forces changed. If so, a new equilibrium must be computed. The friction
+        force of a slipping node becomes the friction coefficient times the normal force. The
+        direction of the friction force does not change.
 
         fraction: applied fraction (0 to 1) of the change of the friction forces.
         """
@@ -483,7 +485,7 @@ def solve_path(
 ) -> list[DeformedSheet]:
     """Compute the equilibria of the sheet while a fingertip advances through the given positions.
 
-    Return the sheet at each position, or only the untouched sheet if there are no positions.
+    Returns the sheet at each position, or only the untouched sheet if there are no positions.
 
     world_from_left_edge, world_from_right_edge: poses (4, 4) of the clamped edges. The origin is
         the centre of the edge, and y points along the edge.
@@ -608,7 +610,7 @@ def _cone(mesh: _Mesh, focus_m: tuple[float, float], rubber: TrueRubber) -> Floa
 def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, int]:
     """Minimise the energy of the sheet by Newton's method with a line search.
 
-    Return the node positions (nodes, 3), m, and the number of steps. Raises NotConvergedError if
+    Returns the node positions (nodes, 3), m, and the number of steps. Raises NotConvergedError if
     the residual force exceeds the tolerance.
     """
     positions = start.copy()

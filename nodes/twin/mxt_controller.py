@@ -61,12 +61,12 @@ FIRST_STEP_RAD = 0.01
 """The maximum difference, for each joint, between the first set-point and the measured angle."""
 
 STEP_CYCLES = 2.0
-"""The maximum step between set-points, divided by the step of a joint at full speed in one
-cycle."""
+"""The maximum step between set-points, as a multiple of the distance that a joint moves at full
+speed in one cycle."""
 
 
 class MxtError(FlexsheetError):
-    """Raised when an invalid command ends the robot program of a simulated controller."""
+    """An error for an invalid command, which ends the robot program of a simulated controller."""
 
     code = "mxt-program"
     remedy = "No action is needed: the simulated controller's program restarts."
@@ -81,12 +81,12 @@ class MxtController:
     - a motion command before a packet that only requests the state
     - an unknown command or data type
     - joint angles outside the allowed range
-    - a first set-point away from the measured joint angles
+    - a first set-point that is far from the measured joint angles
     - a jump of the set-point
     - no packet for `timeout_s`
 
-    servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joint
-        angles.
+    servo_lag_s, backlash_rad: see `Servo`.
+    noise_rad: standard deviation of the measured joint angles.
     filter_s: time constant of the low-pass filter on set-points.
     load_nm (6,): joint torques that the sheet's tension causes. The simulator sets them.
     restart_after_s: time after which the program restarts automatically.
@@ -151,8 +151,8 @@ class MxtController:
     def receive_command(self, packet: bytes, sender: Address) -> None:
         """Store a packet for the next cycle; a newer packet replaces it.
 
-        Packets of wrong length are ignored. While a sender has control, packets from other senders
-        are also ignored.
+        Packets with a wrong length are ignored. While a sender has control, packets from other
+        senders are also ignored.
         """
         if len(packet) != _BYTES or (self._master not in (None, sender)):
             self.refused += 1
@@ -246,7 +246,7 @@ class MxtController:
             self._moved = False
 
     def _move(self, send_type: int, data: Floats) -> None:
-        """Check and store a set-point; raise MxtError if the set-point is invalid."""
+        """Check and store a set-point. Raises MxtError if the set-point is invalid."""
         if self._master is None:
             raise MxtError("a move command came before a packet that only requests the state")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
@@ -262,7 +262,10 @@ class MxtController:
         self._moved, self.wanted_rad = True, joints
 
     def _set_point(self, send_type: int, data: Floats) -> Floats:
-        """Decode the set-point (6,), rad, of a packet; raise MxtError if it is invalid."""
+        """Decode the set-point (6,), rad, of a packet.
+
+        Raises MxtError if the set-point is invalid.
+        """
         if send_type != _JOINTS[0]:
             raise MxtError(f"the set-point has the unknown data type {send_type}")
         if not np.isfinite(data).all():
@@ -342,7 +345,10 @@ class MxtServer:
 
     @property
     def port(self) -> int:
-        """Return the network port of the server; for port 0, the system chooses a free port."""
+        """Return the network port of the server.
+
+        If the configured port is 0, the system chooses a free port.
+        """
         if self._transport is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")
         return int(self._transport.get_extra_info("sockname")[1])

@@ -59,7 +59,9 @@ class Nail:
         )
 
     def find_normal(self, radius_m: float) -> Floats | None:
-        """Return the direction (3,) from the finger's axis to the nail; None if it is round.
+        """Return the direction (3,) from the finger's axis to the nail.
+
+        Returns None if the finger is round.
 
         radius_m: half of the finger's breadth.
         """
@@ -95,7 +97,7 @@ class Nail:
 
     @property
     def knuckle_shift_m(self) -> Floats:
-        """Return the displacement (3,), m, of the knuckle and the hand by the finger's tilt."""
+        """Return the displacement (3,), m, of knuckle and hand that the finger's tilt causes."""
         return np.asarray(FINGER_LENGTH_M * (self.direction - np.array(FINGER_DIRECTION)))
 
 

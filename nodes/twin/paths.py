@@ -113,12 +113,12 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the maximum length (m) of a stroke in one direction, and whether it reaches an
-        edge.
+        """Return the maximum length (m) of a stroke in one direction.
 
         The stroke starts at the front of the object and follows the geodesic in the direction
         `heading` (3,). It ends at an edge of the object, or at the maximum angle between the
-        surface normal and the direction to the user.
+        surface normal and the direction to the user. The second result is whether the stroke
+        reaches an edge.
 
         most: cosine of the maximum angle.
         """
@@ -138,7 +138,10 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines to the surface over (along, arc), for 1.25 times the range of strokes."""
+        """Fit splines to the surface as functions of `along` and `arc`.
+
+        The splines cover 1.25 times the range of strokes.
+        """
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
             for half in (0.625 * size for size in self.touchable_m)
@@ -156,8 +159,8 @@ class SurfaceMap:
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
     """Return the surface point nearest to a distant user.
 
-    If this point is on an end of the object, return the point that the user sees in the direction
-    of the object's origin.
+    If this point is on an end of the object, the result is the point that the user sees in the
+    direction of the object's origin.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
@@ -178,8 +181,8 @@ def _lean_rad(found: Nearest, towards_user: Floats) -> float:
 def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
     """Return points and normals (k, n, 3) on the geodesics through points (n, 3).
 
-    starts, headings (n, 3): points and directions of the geodesics at these points. ticks (k,):
-    ascending distances (m) at which points are computed. The middle element is 0.
+    starts, headings (n, 3): points and directions of the geodesics at these points.
+    ticks (k,): ascending distances (m) at which points are computed. The middle element is 0.
     """
     centre = len(ticks) // 2
     begun = shape.closest(starts)
@@ -216,14 +219,14 @@ def _surface_map_of(scene: Scene) -> SurfaceMap:
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
-    """Return whether all world points (n, 3) lie in the scene's finger volume with a margin (m)."""
+    """Return whether all world points (n, 3) are at least `margin_m` inside the finger volume."""
     low = scene.finger.volume_min_m + margin_m
     high = scene.finger.volume_max_m - margin_m
     return bool((points >= low).all() and (points <= high).all())
 
 
 def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
-    """Return the times (n,), s, of a path after slowing it down to the finger's maximum speed.
+    """Return the times (n,), s, of a path that is slowed down to the finger's maximum speed.
 
     All times are multiplied by the same factor of at least 1.
 
@@ -246,7 +249,7 @@ def place_path(
     """Make a path in the scene from a smooth motion in surface positions.
 
     If the path with wander and tremor would leave the scene's finger volume, the motion is scaled
-    down. If it would exceed the scene's maximum finger speed, the motion is slowed down.
+    down. If the path would exceed the scene's maximum finger speed, the motion is slowed down.
 
     times_s, places: sample times (n,) and surface positions (n, 3), m.
 
@@ -279,10 +282,11 @@ def place_path(
 
 
 def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
-    """Load a recorded fingertip path, and map it to the scene's object. Its label is the file name.
+    """Load a recorded fingertip path, and map the path to the scene's object.
 
-    The file has the columns t_s, x_mm, y_mm and z_mm, with y upwards, as hand trackers write them.
-    The mapping preserves the motion and changes its location:
+    The label of the path is the file name. The file has the columns t_s, x_mm, y_mm and z_mm, with
+    y upwards, as hand trackers write them. The mapping preserves the motion and changes its
+    location:
 
     1. Rotate: the recorded x, y, z become the world's x, y, z (right, up, towards the user).
     2. Scale, if necessary, by one factor. Then the central 90 % of each coordinate fit the
@@ -381,5 +385,7 @@ def _read_recording(csv_path: Path) -> Floats:
             )
         rows.append(row)
     if len(rows) < 2:
-        raise FingerPathError(f"{csv_path}: {len(rows)} samples found; a path needs at least two")
+        raise FingerPathError(
+            f"{csv_path}: {len(rows)} samples found; give a path with at least two samples"
+        )
     return np.array(rows)

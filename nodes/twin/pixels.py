@@ -66,17 +66,17 @@ ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
 window."""
 
 EMPTY_FRACTION = 1.2
-"""The maximum ratio of the area of a window that contains two windows to the sum of their areas. Up
-to this ratio, the two windows are joined."""
+"""The maximum area of a window that joins two windows, as a multiple of the sum of their areas. If
+the area would be larger, the two windows are not joined."""
 
 LIT_RADIUS_M, LIT_LEVEL = 0.0028, 150.0
-"""The radius (m) of a projected mark, and the grey level that the mark adds to the sheet. The area
-is that of 10 x 10 pixels of 0.5 mm."""
+"""The radius (m) of a projected mark, and the grey level that the mark adds to the sheet. The mark
+has the same area as 10 x 10 projector pixels of 0.5 mm."""
 
 NO_POINTS = np.zeros((0, 3))
 
 SPOTS = 61
-"""The number of Gaussian spots as whose sum a flat marker is drawn."""
+"""The number of Gaussian spots whose sum represents a flat marker."""
 
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -96,7 +96,7 @@ class Sensor:
     aperture_m, focus_m: aperture diameter and focused distance. The image of a point at depth z is
         a disc with the diameter focal_px * aperture_m * |1/z - 1/focus_m|. The disc is drawn as a
         Gaussian with the same standard deviation, a quarter of the diameter.
-    exposure: factor on all light. With a factor well above 1, the marker saturates.
+    exposure: factor by which all light is multiplied. If it is well above 1, the marker saturates.
     noisy_backgrounds: number of precomputed noisy background images per camera.
     """
 
@@ -127,8 +127,9 @@ class Sensor:
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
         """Return a copy of the sensor that blurs points at the depth `depth_m` by defocus.
 
-        defocus_px: standard deviation of the blur by the defocus alone. Raises ValueError if even a
-            focus at infinity gives less blur.
+        defocus_px: standard deviation of the blur by the defocus alone.
+
+        Raises ValueError if even a focus at infinity gives less blur.
         """
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
@@ -180,7 +181,7 @@ class CameraView:
     def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
         """Return the bounding box of pixels, enlarged by `reach_px` on each side, within the image.
 
-        Return None if the bounding box is outside the image.
+        Returns None if the bounding box is outside the image.
         """
         height, width = self.canvas.shape
         rows = slice(
@@ -239,7 +240,7 @@ class TwinCamera:
         marker_radius_m: float | None = None,
         marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
-        """Return a copy of the camera with another marker or sensor. The background is unchanged.
+        """Return a copy of the camera with another marker or sensor, and the same background.
 
         marker_offset_m: vector (3,) from the fingertip to the marker, in the world frame.
         """
@@ -320,8 +321,9 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
-        """Return the camera image: the drawn rectangles (`windows`) of the canvas on a noisy
-        background. Then reset the canvas.
+        """Return the camera image, and reset the canvas.
+
+        The image is a noisy background with the drawn rectangles (`windows`) of the canvas.
         """
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
@@ -345,8 +347,8 @@ class TwinCamera:
     ) -> list[Window]:
         """Draw the finger and all moving objects on the camera's canvas; return the drawn windows.
 
-        tips (n, 3): fingertip positions during the exposure, m. times_s (n,): times of these
-        positions.
+        tips (n, 3): fingertip positions during the exposure, m.
+        times_s (n,): times of these positions.
         """
         clutter, sensor = self.clutter, self.sensor
         time_s, tip = float(times_s.mean()), tips.mean(axis=0)
@@ -404,7 +406,7 @@ class TwinCamera:
     ) -> Window | None:
         """Draw a tapered capsule between two world points (2, 3), and return the drawn window.
 
-        Return None if the capsule is not visible.
+        Returns None if the capsule is not visible.
 
         lit: whether the lamp illuminates the capsule from the side; otherwise its grey level is
             constant.
@@ -457,7 +459,7 @@ class TwinCamera:
     ) -> Window | None:
         """Draw a luminous ball that passes through world points (n, 3) during the exposure.
 
-        Return the drawn window, or None if the ball is not visible.
+        Returns the drawn window, or None if the ball is not visible.
 
         adds: whether the light of the ball is added to the background; otherwise the ball hides the
             background.
@@ -482,7 +484,7 @@ class TwinCamera:
         """Draw the marker as a flat disc that passes through world points (n, 3) during the
         exposure.
 
-        Return the drawn window, or None if the disc is not visible or is seen from behind.
+        Returns the drawn window, or None if the disc is not visible or is seen from behind.
 
         The disc is a sum of Gaussian spots. For a disc larger than the blur, the sum is within 1 %
         of the light of a uniform disc.

@@ -106,7 +106,8 @@ class LitSheet:
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
         """Store the parameters of the simulated devices.
 
-        camera, projector: true parameters. seed: random seed of the image noise.
+        camera, projector: true parameters.
+        seed: random seed of the image noise.
         """
         self._scene, self._camera, self._projector = scene, camera, projector
         self._random = np.random.default_rng(seed)
@@ -169,7 +170,7 @@ class LitSheet:
     ) -> tuple[slice, slice]:
         """Return the ranges of image rows and columns in which the sheet can be visible.
 
-        Return the whole image if a part of the sheet is behind the camera.
+        Returns the whole image if a part of the sheet is behind the camera.
         """
         height, width = self._camera.height_px, self._camera.width_px
         half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
@@ -217,7 +218,7 @@ class LitSheet:
 
 
 def _fit_bend(points: Floats) -> Floats:
-    """Fit a polynomial z(x, y), coefficients (5, 5), to points (n, 3) in the frame of the sheet."""
+    """Fit a polynomial z(x, y) to points (n, 3) in the sheet's frame; return its coefficients."""
     powers = polynomial.polyvander2d(points[:, 0], points[:, 1], [4, 4])
     return np.asarray(np.linalg.lstsq(powers, points[:, 2], rcond=None)[0].reshape(5, 5))
 
@@ -225,7 +226,7 @@ def _fit_bend(points: Floats) -> Floats:
 def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Intersect rays (..., 3) from a point with the x-y plane of a pose (4, 4).
 
-    Return the points (..., 3), and a mask of the points in front of the origin.
+    Returns the points (..., 3), and a mask of the points in front of the origin.
     """
     normal = plane[:3, 2]
     slant = directions @ normal
@@ -247,12 +248,11 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """Return the distances (n,), m, between intended and actual projected points, as an eye sees
-    them.
+    """Return the distances (n,), m, between intended and actual projected points.
 
-    The distances are measured on the imaginary screen (world plane z = 0). The points form a grid
-    of +-half_m on each plane (4, 4). The calibrated projector `believed` computes their pixels, and
-    the projector `true` projects these pixels.
+    The distances are measured as an eye sees them on the imaginary screen (world plane z = 0). The
+    points form a grid of +-half_m on each plane (4, 4). The calibrated projector `believed`
+    computes their pixels, and the projector `true` projects these pixels.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

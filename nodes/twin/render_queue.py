@@ -28,7 +28,7 @@ class RenderQueue(Generic[J]):
 
     @property
     def is_full(self) -> bool:
-        """Return whether the queue has no room for a further job."""
+        """Return whether the queue is full."""
         return len(self._jobs) >= self._max_length
 
     def is_known(self, key: Key, now_ns: int) -> bool:
@@ -41,7 +41,10 @@ class RenderQueue(Generic[J]):
         return now_ns - at_ns < self._min_interval_s * 1e9
 
     def reject(self, key: Key) -> bool:
-        """Record that the full queue rejected a job; return True at the first time for this key."""
+        """Record that the full queue rejected a job.
+
+        Returns True if this is the first rejected job with this key.
+        """
         is_new = key not in self._rejected
         self._rejected.add(key)
         return is_new
@@ -51,7 +54,7 @@ class RenderQueue(Generic[J]):
         self._jobs[key] = job
 
     def next(self) -> tuple[Key, J]:
-        """Return the key and the content of the oldest job; the job remains in the queue."""
+        """Return the key and the content of the oldest job, which remains in the queue."""
         return next(iter(self._jobs.items()))
 
     def finish(self, key: Key, now_ns: int) -> None:

@@ -23,7 +23,8 @@ FOCAL_DEVIATION = 0.005
 """The relative standard deviation of the focal length between devices of one model."""
 
 ASPECT_DEVIATION = 0.0005
-"""The relative standard deviation of fy from fx. It is small because pixels are nearly square."""
+"""The standard deviation of the relative difference between the focal lengths fx and fy. It is
+small because pixels are nearly square."""
 
 CENTRE_DEVIATION_PX = 4.0
 """The standard deviation (px) of the principal point between devices, for an image width of 640
@@ -47,7 +48,7 @@ NEWTON_STEPS = 12
 
 
 def make_true_camera(camera: StereoCamera) -> StereoCamera:
-    """Return true camera parameters that deviate at random from those in the scene.
+    """Return true camera parameters that deviate at random from the parameters in the scene.
 
     The random seed is derived from the device name. The deviations are normally distributed and
     limited to two standard deviations. The pose of the left camera, image size, rate and exposure
@@ -112,7 +113,8 @@ def project_ray(lens: Lens, u: T, v: T) -> tuple[T, T]:
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
     """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion; dy/du equals dx/dv.
 
-    u, v: x/z and y/z of the ray. x, y: these slopes after the distortion.
+    u, v: x/z and y/z of the ray.
+    x, y: these slopes after the distortion.
     """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
@@ -126,7 +128,7 @@ def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
 def stereo_pixels(
     camera: StereoCamera, left_from_world: Floats, points: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the pixels (2,) of a moving point in the left and in the right image.
+    """Return the pixel (2,) of a moving point in the left image, and in the right image.
 
     points (2, 3): world positions of the point at the exposures of both images, m.
     """

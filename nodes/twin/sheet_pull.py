@@ -1,4 +1,4 @@
-"""Compute the true sheet, and the displacement of the arms by its tension and weight.
+"""Compute the shape of the true sheet, and how far its tension and weight displace the arms.
 
 An apparatus contains the true parameters of the simulated hardware. A flange is the last link of an
 arm.
@@ -79,7 +79,7 @@ class SheetPull:
     The force of a finger on the sheet is neglected, because it is small compared with the tension.
 
     distances_m, forces_n (n,): tension as a function of the distance between the clamped edges.
-    compliances_m_per_n: displacement of the left and right flange per force.
+    compliances_m_per_n: displacements of the left and the right flange per force.
     weight_n (3,): weight of the sheet. Each flange carries half of the weight.
     history: hysteresis and creep of the tension; None if the rubber is elastic.
     """
@@ -95,7 +95,7 @@ class SheetPull:
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
         """Compute the tension of the true sheet with the membrane model.
 
-        Return None if both arms are rigid, because then no flange is displaced.
+        Returns None if both arms are rigid, because then no flange is displaced.
         """
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
@@ -126,7 +126,7 @@ class SheetPull:
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Add the tension at a distance of the edges to the history of hysteresis and creep."""
+        """Add the tension at the edges' distance to the history of hysteresis and creep."""
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio
@@ -146,7 +146,7 @@ class SheetPull:
 
         The flanges are not rotated.
 
-        time_s: time of the poses; it must not decrease.
+        time_s: time of the poses, which must not decrease between calls.
         """
         left_m = (world_from_left_flange @ left_flange_from_edge)[:3, 3]
         right_m = (world_from_right_flange @ right_flange_from_edge)[:3, 3]

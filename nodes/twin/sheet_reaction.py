@@ -53,8 +53,8 @@ class SheetReaction:
     stretches (s,): stretch ratios.
     depths_m (d,): depths in equal steps from 0.
     centre_n (s, d): force at the centre.
-    ratios (p, p, d): ratio of the force at POSITION_FRACTIONS of width and height to the force at
-        the centre.
+    ratios (p, p, d): force divided by the force at the centre, at the p POSITION_FRACTIONS of the
+        width and of the height.
     """
 
     width_m: Floats
@@ -65,9 +65,12 @@ class SheetReaction:
     ratios: Floats
 
     def curve_n(self, distance_m: float, x_m: float, y_m: float) -> Floats:
-        """Return the forces (d,), N, at `depths_m`; zeros if the position is beside the sheet.
+        """Return the forces (d,), N, at `depths_m`.
 
-        distance_m: distance between the edges. x_m, y_m: position relative to the sheet's centre.
+        The forces are zero if the position is beside the sheet.
+
+        distance_m: distance between the edges.
+        x_m, y_m: position relative to the sheet's centre.
         """
         if abs(x_m) >= 0.5 * distance_m or abs(y_m) >= 0.5 * self.height_m[0]:
             return np.zeros(len(self.depths_m))
@@ -85,7 +88,10 @@ class SheetReaction:
 def load_or_compute_reaction(
     scene: Scene, apparatus: Apparatus | None, cache_dir: Path | None = None
 ) -> SheetReaction:
-    """Return the force table of a scene's true sheet from the cache, or compute it in 10 s."""
+    """Return the force table of a scene's true sheet from the cache, or compute the table.
+
+    The computation takes 10 s.
+    """
     true_scene = apply_apparatus(scene, apparatus)
     sheet = true_scene.sheet
     rubber = replace(
@@ -117,14 +123,17 @@ def compute_reaction(
 ) -> SheetReaction:
     """Compute the force table with the membrane model. The sheet's weight is neglected.
 
-    stretches: stretch ratios (s,). depths_m: push depths (n,). Raises NotConvergedError if the
-    iteration does not converge for shallow pushes.
+    stretches: stretch ratios (s,).
+    depths_m: push depths (n,).
+
+    Raises NotConvergedError if the iteration does not converge for shallow pushes.
     """
 
     def push_n(stretch: float, across: float, along: float) -> Floats:
-        """Return the normal forces (n,), N, of a push at all depths.
+        """Return the normal forces (n,), N, of a push at all n depths.
 
-        across, along: position, as fractions of the sheet's width and height from its centre.
+        across, along: position relative to the sheet's centre, as fractions of the sheet's width
+            and height.
         """
         half_m = 0.5 * stretch * rubber.width_m
         edges = [transform(np.eye(3), [side * half_m, 0.0, 0.0]) for side in (-1.0, 1.0)]

@@ -1,4 +1,4 @@
-"""Compute the surface of the unloaded sheet: the plane between its edges, and its sag by weight.
+"""Compute the surface of the unloaded sheet: the plane between its edges, and its sag by gravity.
 
 The simulator's membrane model computes the sag. It shares no code with the sag model of the nodes.
 """
@@ -27,10 +27,11 @@ sag differs by 0.3 % from the sag with 32 elements.
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
-"""The vertical components of the sheet's unit normal in the sag table. At 0, the sag is zero."""
+"""The vertical components of the sheet's unit normal in the sag table. If the component is 0, the
+sag is 0."""
 
 STRETCH_MARGIN = 0.005
-"""The extension of the sag table beyond the scene's range of stretch ratios at both ends."""
+"""The amount by which the sag table exceeds the scene's range of stretch ratios at both ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class SheetPlanes:
 
 
 class SagTable:
-    """A table of the unloaded sheet's sag over stretch ratio, tilt and position."""
+    """A table of the unloaded sheet's sag as a function of stretch ratio, tilt and position."""
 
     def __init__(
         self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float
@@ -76,8 +77,9 @@ class SagTable:
     ) -> tuple[Floats, Floats, Floats]:
         """Return the sag (n,), m, along the normal, and its slopes (n,) along x and along y.
 
-        distances_m: distances (n,) between the edges. leans: vertical components (n,) of the sheet
-        normals. x_m, y_m: positions (n,) relative to the sheet's centre.
+        distances_m: distances (n,) between the edges.
+        leans: vertical components (n,) of the sheet normals.
+        x_m, y_m: positions (n,) relative to the sheet's centre.
         """
         stretches = np.clip(distances_m / self._width_m, *self._range)
         by_stretch = lagrange(self._stretches, stretches) / _compute_tension(stretches)
@@ -96,8 +98,8 @@ class SagTable:
 def _compute_tension(stretch: Floats) -> Floats:
     """Return the normalized tension (n,) of a uniaxially stretched neo-Hookean sheet.
 
-    The product of sag and tension depends little on the stretch. Therefore its interpolation is
-    accurate.
+    The product of sag and tension depends little on the stretch. Therefore interpolating this
+    product is accurate.
     """
     return stretch - stretch**-2
 

@@ -156,9 +156,9 @@ class Tolerance:
     source, calibrated_source: literature or data sheet from which the numbers are taken.
     paper: distribution for the profile `paper`; None if it equals `modern`.
     calibrated: distribution after calibration; None if no calibration affects the parameter.
-    pair: distribution of the deviation of each arm from the common sample of both arms; None if the
+    pair: distribution by which each arm deviates from a sample that both arms share; None if the
         samples of both arms are independent.
-    frame_periods: profiles in which the unit of the sample is the period of the true camera instead
+    frame_periods: profiles in which the distribution is given in periods of the true camera instead
         of seconds.
     """
 
@@ -344,7 +344,7 @@ for each key."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:
-    """Return the dotted paths of a key; a key with "*" has one path for each side."""
+    """Return the dotted paths of a key. A key that contains "*" has one path for each side."""
     return tuple(key.replace("*", side) for side in ("left", "right")) if "*" in key else (key,)
 
 
@@ -374,9 +374,9 @@ def deviate_apparatus(
 ) -> Apparatus:
     """Make an apparatus (true hardware parameters) in which only one parameter deviates.
 
-    key: row of the tolerance table; other keys raise KeyError. sigmas: size of the deviation, in
-    standard deviations of a normal distribution. All components of a vector deviate equally. Both
-    arms or lenses also deviate equally.
+    key: row of the tolerance table; other keys raise KeyError.
+    sigmas: size of the deviation, in standard deviations of a normal distribution. All components
+        of a vector deviate equally. Both arms or lenses also deviate equally.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)
@@ -414,7 +414,7 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random generator of a parameter; parameters have independent generators."""
+    """Return the random generator of a parameter, which is independent of other parameters."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 

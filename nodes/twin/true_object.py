@@ -49,7 +49,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """The surface mesh of a scene's virtual object; a plane becomes a rectangle."""
+    """The surface mesh of a scene's virtual object. A plane is represented by a rectangle."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -125,7 +125,7 @@ class TrueBody:
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
     """Find the points of a mesh that are nearest to `points` (n, 3).
 
-    Return the triangle corners (n, 3) and barycentric weights (n, 3) of the nearest points. Raises
+    Returns the triangle corners (n, 3) and barycentric weights (n, 3) of the nearest points. Raises
     ValueError if all triangles have zero area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
@@ -218,7 +218,10 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return the vertices and triangles of a closed surface over the directions `_directions`."""
+    """Return vertices, and the triangles that connect them to a closed surface.
+
+    vertices (n, 3): one vertex in each direction that `_directions` returns, in the same order.
+    """
     rows, count = 2 * ALONG - 1, len(vertices)
     first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
     caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]

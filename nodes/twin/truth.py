@@ -39,13 +39,13 @@ class SimulatorParameters(NodeParameters):
 
     apparatus: Apparatus | None = Field(
         default=None,
-        description="true hardware parameters, set by `--apparatus`; null: the true parameters are "
-        "those of the scene",
+        description="true hardware parameters, set by `--apparatus`; null: the true parameters "
+        "equal the parameters in the scene",
     )
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return the delay (s) of the true display of a frame after the time that the renderer assumes.
+    """Return the delay (s) of a frame's true display after the time that the renderer assumes.
 
     The frame contains the latency that the renderer assumes. If no frame has been displayed, the
     nominal latency is used. The result is 0 if there is no apparatus.
@@ -168,8 +168,8 @@ def _true_arm(arm: ArmSpec, truth: ArmTruth) -> ArmSpec:
 def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[float, ...]) -> Pose:
     """Return a pose after a translation in the parent frame and a rotation about its own origin.
 
-    shift_m: translation (3,). rotation_rad: rotation vector (3,). With a zero rotation, the angles
-    are exactly unchanged.
+    shift_m: translation (3,).
+    rotation_rad: rotation vector (3,). With a zero rotation, the angles are exactly unchanged.
     """
     rpy_rad = pose.rpy_rad
     if any(rotation_rad):

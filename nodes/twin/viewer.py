@@ -40,8 +40,9 @@ class HeadSway:
 
     @classmethod
     def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
-        """Generate a random head motion from the true eye parameters. Return None if the head is at
-        rest.
+        """Generate a random head motion from the true eye parameters.
+
+        Returns None if the head is at rest.
         """
         if not eyes.sway_m:
             return None
@@ -61,8 +62,8 @@ class Viewer:
     ) -> None:
         """Store the eyes of the scene and the motion of the head.
 
-        sway: motion of the head; None if the head is at rest. random: generator of the alignment
-        errors.
+        sway: motion of the head; None if the head is at rest.
+        random: generator of the alignment errors.
         """
         self._eyes, self._sway, self._random = true_scene.eyes, sway, random
 
@@ -75,7 +76,7 @@ class Viewer:
     def align(self, side: Side, bead: Floats, sheet: DeformedSheet, time_s: float) -> Floats | None:
         """Return the point (3,) of the sheet, world frame, m, that an eye sees behind a bead.
 
-        The point contains a random alignment error. Return None if the sheet is not behind the
+        The point contains a random alignment error. Returns None if the sheet is not behind the
         bead.
 
         bead (3,): position of the bead, world frame, m.
