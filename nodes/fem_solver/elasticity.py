@@ -15,7 +15,7 @@ from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 MAX_POISSON_RATIO = 0.4999
-"""The maximum of Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
+"""The maximum Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
 MIN_VOLUME_RATIO = 1e-6
 """The minimum ratio of an element's Jacobian determinant to the cube of its edge length. For
 flatter elements, rounding errors make the solution useless."""
@@ -85,10 +85,10 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     """Return the Jacobian matrices (e, q, 3, 3) of e elements at q points, and their determinants
     (e, q).
 
-    The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3), m,
-    elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raises
-    SolidMeshError if an element is inverted or flat, or if the coordinates of a node are not
-    finite.
+    The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3):
+    positions of the n nodes, m. elements (e, 10): node indices. local (q, 10, 3): gradients of the
+    shape functions at q points. Raises SolidMeshError if an element is inverted or flat, or if the
+    coordinates of a node are not finite.
     """
     corners = nodes[elements]
     invalid = ~np.isfinite(corners).all(axis=(1, 2))
@@ -115,8 +115,8 @@ def element_stiffness(
 ) -> Floats:
     """Return the stiffness matrices (e, 30, 30), N/m, of e elements.
 
-    nodes (n, 3), m, elements (e, 10): mesh. Raises SolidMeshError if an element is inverted or
-    flat, and ValueError if the material is invalid.
+    nodes (n, 3): positions of the n nodes, m. elements (e, 10): node indices. Raises SolidMeshError
+    if an element is inverted or flat, and ValueError if the material is invalid.
     """
     lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
     points, weights = quadrature()

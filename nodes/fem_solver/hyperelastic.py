@@ -108,10 +108,10 @@ class NeoHookeanSolid:
     def tangents(self, displacement: Floats) -> Floats:
         """Return the tangent stiffness of each element (e, 30, 30), N/m.
 
-        The tangent stiffness is the second derivative of the energy. For the nodes a and b of an
-        element, let g_a and g_b be the gradients of their shape functions, and h = F^-T g. The
-        block of these nodes is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda
-        ln J) h_b h_a^T. displacement (n, 3): displacement of the nodes, m. Raises
+        The tangent stiffness is the second derivative of the energy. Let g_a and g_b be the
+        gradients of the shape functions of two nodes a and b. Let h_a = F^-T g_a and h_b = F^-T
+        g_b. The block of these nodes is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu -
+        lambda ln J) h_b h_a^T. displacement (n, 3): displacement of the nodes, m. Raises
         InvertedElementError if an element is inverted.
         """
         _, inverse, log = self._state(displacement)
