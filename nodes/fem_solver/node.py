@@ -97,7 +97,8 @@ class FemSolver(Node):
 
     def _describe(self, current: body.SceneBody) -> str:
         """Return a text that states the current method, its force error and the number of skin
-        nodes."""
+        nodes.
+        """
         nodes = len(current.skin.vertices_world_m)
         bodies = (current, *(old for old, _ in self._replaced))
         errors = " and ".join(

@@ -97,7 +97,8 @@ def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
     """Return the snapshot job for pushes on a mesh with the same node spacing on all touchable
-    skin."""
+    skin.
+    """
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
     return snapshots.make_job_on_mesh(
         mesh,
@@ -193,7 +194,8 @@ class LocalTable:
     def body(self, solved: Sequence[Snapshot]) -> SceneBody:
         """Return the body with a table that is built from snapshots.
 
-        solved: snapshots of the jobs in `jobs`, in the same order."""
+        solved: snapshots of the jobs in `jobs`, in the same order.
+        """
         response, radius = self._model.response, self._scene.finger.radius_m
         linear = unit_linear_body(
             response, self._body.shape, response.rest[self._model.bounds], radius

@@ -26,8 +26,7 @@ LEVELS = 32767
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path of the file with the shipped snapshots of a table. The file need not exist.
-    """
+    """Return the path of the file with shipped snapshots of a table. The file need not exist."""
     return FOLDER / entry.path(FOLDER).name
 
 
@@ -55,7 +54,8 @@ def _decode(arrays: Mapping[str, NDArray[Any]]) -> Snapshot:
 
 def save_shipped(path: Path, snapshots: Mapping[str, Snapshot]) -> None:
     """Write snapshots, given with their names as keys, to a compressed file. The displacements are
-    rounded."""
+    rounded.
+    """
     arrays: dict[str, NDArray[Any]] = {}
     for name, one in snapshots.items():
         scale_m = np.abs(one.moved).max(axis=(1, 2), initial=1e-9) / LEVELS

@@ -91,7 +91,8 @@ class SampledLoop:
     period_s: time between two measurements.
     delay_s: time from a measurement until the sheet reaches the position computed from it.
     bandwidth_rad_per_s: natural frequency of the filter of the depth; infinite if there is no
-    filter. lead_s: time by which the filtered depth is extrapolated with its estimated rate.
+        filter.
+    lead_s: time by which the filtered depth is extrapolated with its estimated rate.
     """
 
     period_s: float
@@ -330,6 +331,7 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
 def _descend(slopes: Floats) -> Floats:
     """Reduce slopes so that they never increase with the delay or the stiffness.
 
-    slopes (d, f, k): slopes for d delays, f bandwidths and k stiffnesses."""
+    slopes (d, f, k): slopes for d delays, f bandwidths and k stiffnesses.
+    """
     result = np.minimum.accumulate(np.minimum.accumulate(slopes, axis=0), axis=2)
     return np.asarray(result)

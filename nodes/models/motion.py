@@ -260,7 +260,7 @@ def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
 def follow_trajectory(
     motion: SheetMotion, time_s: float, *, keep_s: float, brake_s: float
 ) -> SheetMotion:
-    """Return the motion at the time `time_s` after the last target.
+    """Return the motion at the time `time_s` after a given motion, if no further target arrives.
 
     The twist (velocity) is constant for the time `keep_s`, and then decreases uniformly to zero
     within the time `brake_s`. The stretch ratio is constant.
@@ -281,8 +281,9 @@ def _decelerate(velocity: Floats, change: float) -> Floats:
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """Return a pose (4, 4) after correction of rounding errors that make the rotation matrix
-    non-orthonormal. The method is Gram-Schmidt on the axes x and y."""
+    """Make the rotation matrix of a pose (4, 4) orthonormal again, and return the pose. The method
+    is Gram-Schmidt on the x and y axes.
+    """
     (ax, bx, _, px), (ay, by, _, py), (az, bz, _, pz), last = pose.tolist()
     length = sqrt(ax * ax + ay * ay + az * az)
     ax, ay, az = ax / length, ay / length, az / length

@@ -19,8 +19,7 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 GRID_STEP_S = 0.004
-"""The step (s) of the grid of lags. Between grid points, the minimum is computed with a parabola.
-"""
+"""The step (s) of the grid of lags. A parabola gives the minimum between grid points."""
 
 MEMORY_S = 1.2
 """The time constant, in seconds, with which the weight of samples decays."""
@@ -222,8 +221,8 @@ class ServoLagEstimator:
             self._timing_s += weight / self._timing_weight * (timing_s - self._timing_s)
 
     def _solve(self) -> LagEstimate | None:
-        """Return an estimate of the lag, at which the variance is smallest. Return None if the
-        motion is insufficient for an estimate.
+        """Estimate the lag as the value with the smallest variance. Return None if the motion is
+        insufficient for an estimate.
         """
         if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
             return None

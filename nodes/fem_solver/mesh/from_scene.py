@@ -305,7 +305,8 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 def _slab_normals(nodes: Floats) -> Floats:
     """Return a unit vector (n, 3) for each node of a slab.
 
-    The vector is the outward normal at nodes of the top and the bottom, and +x at other nodes."""
+    The vector is the outward normal at nodes of the top and the bottom, and +x at other nodes.
+    """
     normals = np.zeros_like(nodes)
     normals[:, 0] = 1.0
     low, high = nodes[:, 2].min(), nodes[:, 2].max()
