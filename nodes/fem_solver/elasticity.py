@@ -95,7 +95,8 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     if invalid.any():
         raise SolidMeshError(
             f"{int(invalid.sum())} of {len(elements)} elements have node positions that are not "
-            f"finite; the first of these elements has the index {int(np.argmax(invalid))}"
+            f"finite; the first of these elements has the index {int(np.argmax(invalid))}; "
+            "correct the node positions"
         )
     jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
     determinant: Floats = np.linalg.det(jacobian)
@@ -105,7 +106,7 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
         raise SolidMeshError(
             f"{int(bad.sum())} of {len(elements)} elements are inverted or flat; the first of "
             f"these elements has the index {int(np.argmax(bad))} (minimum determinant "
-            f"{determinant.min():.3g} m^3)"
+            f"{determinant.min():.3g} m^3); repair the mesh"
         )
     return jacobian, determinant
 

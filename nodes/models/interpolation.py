@@ -32,7 +32,9 @@ def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats
     """
     count = len(path)
     if count < 2:
-        raise ValueError(f"the predicted path has {count} points; at least two are required")
+        raise ValueError(
+            f"the predicted path has {count} points; at least two are required; send a longer path"
+        )
     steps = time_s / step_s
     i = min(max(int(np.floor(steps)), 0), count - 2)
     t = steps - i

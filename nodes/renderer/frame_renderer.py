@@ -86,7 +86,7 @@ class FrameRenderer:
             self.extrapolator.add(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Return whether a new frame would be equal to the last frame because no input has changed."""
+        """Return whether a new frame would equal the last frame because no input has changed."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)

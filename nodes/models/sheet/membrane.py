@@ -482,6 +482,6 @@ def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None
     if residual < 100.0 * TOLERANCE * grid.force_scale:
         return positions
     raise NoEquilibriumError(
-        f"the membrane has no equilibrium: the residual is {residual:.2e} N, the tolerance "
-        f"is {TOLERANCE * grid.force_scale:.2e} N"
+        f"the membrane has no equilibrium: the residual is {residual:.2e} N, but the "
+        f"tolerance is {TOLERANCE * grid.force_scale:.2e} N; reduce the push depth"
     )
