@@ -51,10 +51,10 @@ def locate(
     """Return the contact of a fingertip at `point` (3,), m, and the anchor for the next call.
 
     anchor: anchor that the previous call returned; None before the first call. The contact point is
-    usually the nearest surface point. The anchor is the contact point if the fingertip is near the
-    centre of curvature, or if the nearest point is on the far side of the body. Therefore a finger
-    that is pushed through a body remains in contact with the side that it entered. Raises
-    ValueError if a coordinate of the point is not finite.
+    usually the nearest surface point. In two cases, the anchor is the contact point instead: the
+    fingertip is near the centre of curvature, or the nearest point is on the far side of the body.
+    Therefore a finger that is pushed through a body remains in contact with the side that it
+    entered. Raises ValueError if a coordinate of the point is not finite.
     """
     if not np.isfinite(point).all():
         raise ValueError(

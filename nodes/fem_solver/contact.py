@@ -302,9 +302,9 @@ class DragContact:
     def solve(self, contact: NormalContact, drag: Floats) -> tuple[Ints, Floats, Floats]:
         """Return the tangential forces of a sticking finger for a given normal contact.
 
-        drag (3,): displacement of the finger since it started to stick, m. Return the row indices
-        (2k,) of `influence` for the k loaded nodes, the forces (2k,), N, for these rows, and the
-        total force (3,), N, on the finger.
+        drag (3,): displacement of the finger since it started to stick, m. Return row indices (2k,)
+        of `influence` for the k loaded nodes, the forces (2k,), N, for these rows, and the total
+        force (3,), N.
         """
         nodes, count = contact.nodes, len(contact.nodes)
         rows = (2 * nodes[:, None] + np.arange(2)).ravel()

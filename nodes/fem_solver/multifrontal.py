@@ -173,7 +173,8 @@ class NestedDissection:
         """Divide elements recursively, and append each part after its halves to the list of parts.
 
         members: indices of the elements. Return the index of the last part, its k free nodes (k,),
-        and, for each of these nodes, the number of elements of the part that contain the node (k,).
+        and a count (k,) for each of these nodes. The count is the number of elements in the part
+        that contain the node.
         """
         if len(members) <= LEAF_ELEMENTS:
             present, counts = np.unique(self._elements[members], return_counts=True)

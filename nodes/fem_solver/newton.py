@@ -223,8 +223,8 @@ class NeoHookeanBody:
         outward normals. tolerance: maximum residual force, relative to the largest nodal force.
         min_step_fraction: minimum fraction of a load step. max_step_ratio: maximum load step, in
         finger radii. factor_dtype: precision of the factors of the tangent stiffness; it affects
-        only the search direction. mirror_axes: axes of planes of symmetry if the mesh contains only
-        one side of these planes. Then the forces contain only the contribution of this side.
+        only the search direction. mirror_axes: axes of the planes of symmetry if the mesh contains
+        only one side of them. In this case, the forces contain only the contribution of this side.
         finger_axis (3,): direction of the finger's shaft; None if the finger is a sphere. Raises
         SolidMeshError if an element is inverted, and ValueError if the material is invalid.
         """

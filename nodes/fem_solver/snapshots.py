@@ -75,8 +75,8 @@ class SnapshotJob:
 
     nodes (n, 3): positions of the n nodes, m. elements (e, 10): node indices. fixed (n,): whether
     each node is fixed. faces (f, 6): six-node triangles that the finger can touch. depths_m: push
-    depths. mirror_axes: axes of planes of symmetry through the sample point if the mesh contains
-    only one side of these planes, 0 for x = 0 and 1 for y = 0.
+    depths. mirror_axes: axes of the planes of symmetry at which the mesh ends, 0 for x = 0 and 1
+    for y = 0. These planes contain the sample point.
     """
 
     nodes: Floats
@@ -379,7 +379,7 @@ def make_job_on_mesh(
 ) -> SnapshotJob:
     """Return the job for pushes at a sample point to several depths with a given mesh.
 
-    mirror_axes: axes of planes of symmetry if the mesh contains only one side of these planes.
+    mirror_axes: axes of the planes of symmetry at which the mesh ends, 0 for x = 0 and 1 for y = 0.
     """
     return SnapshotJob(
         nodes=mesh.nodes,

@@ -60,8 +60,8 @@ SPACING_RATIO = 1.0 / 3.0
 """The minimum distance between jets (local quadratic fits) on the same side of the surface, divided
 by the smoothing length `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""The minimum cosine of the angle between the normal of a local quadratic fit (jet) and the normal
-of a vertex that is used for the fit."""
+"""The minimum cosine of the angle between two normals. One is the normal of a local quadratic fit
+(jet), and the other is the normal of a vertex in the fit."""
 MAX_CURVATURE_RATIO = 2.0
 """The maximum product of the curvature (1/m) of a local quadratic fit (jet) and the smoothing
 length `rho` (m)."""
@@ -103,8 +103,8 @@ MAX_EXTENT_FRACTION = 1.0 / 3.0
 MAX_STARTS = 6
 """The maximum number of additional starting points in the search for the global nearest point."""
 MIN_CURVATURE_FACTOR = 0.1
-"""The lower bound on the eigenvalues of I + h A, where h is the height above a surface point and A
-is the shape operator.
+"""The lower bound on the eigenvalues of I + h A. h is the height above a surface point, and A is
+the shape operator.
 
 An eigenvalue is 0 at a centre of curvature.
 """

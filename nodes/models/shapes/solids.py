@@ -328,8 +328,8 @@ class RoundedBoxShape(Convex):
         """Return the face of the core that is nearest to each query (n, 3) inside the core.
 
         before: previous nearest points (n, 3), or None if there are none. Only faces that contain
-            these points are considered. If there are no previous points and several faces are
-            equally near, the first face in the order z, y, x, -z, -y, -x is chosen.
+            these points are considered. If there are none and several faces are equally near, the
+            first face in the order z, y, x, -z, -y, -x is chosen.
 
         Return the axis (n,) and the sign (n,) of the face's normal, the distance from the face
         (n,), m, and whether the choice is ambiguous (n,).

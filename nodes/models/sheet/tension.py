@@ -23,8 +23,8 @@ SAG_PROFILE = (0.9635, 0.23, 1.96)
 """The coefficients a, b and c of the sag profile a + b v^2 + c v^4, where v = y / height.
 
 The profile is the ratio of the sag to the sag of a sheet with uniform tension. Free edges sag more
-than the centre. For a square sheet with stretch ratios from 1.02 to 1.08 and |v| up to 0.25, the
-formula agrees with membrane finite elements within 1 %.
+than the centre. The formula agrees with membrane finite elements within 1 %. This is valid for a
+square sheet with stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
 """
 
 GRAVITY_M_PER_S2 = 9.81
