@@ -77,8 +77,9 @@ def locate_sticking(
 ) -> tuple[ContactQuery, ContactAnchor | None]:
     """Return the contact of a sticking fingertip at `point` (3,), m, and the next anchor.
 
-    anchor: first contact point, to which the fingertip sticks, or None before contact. Pass the
-    returned anchor to the next call. Raises ValueError if a coordinate of the point is not finite.
+    anchor: first contact point, to which the fingertip sticks, or None if there is no contact yet.
+    Pass the returned anchor to the next call. Raises ValueError if a coordinate of the point is not
+    finite.
     """
     query, new_anchor = locate(shape, point, anchor)
     if new_anchor is None or anchor is None:

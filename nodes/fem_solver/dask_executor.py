@@ -56,7 +56,7 @@ class DaskExecutor(Executor):
         """Shut down the executor.
 
         wait: whether to wait for the pending functions. cancel_futures: whether to cancel pending
-        functions and stop running functions, without waiting.
+        functions and stop running functions. In this case, the method does not wait.
         """
         # Workers of a lost scheduler cannot be notified.
         if cancel_futures and self._client.status == "running":

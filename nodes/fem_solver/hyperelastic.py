@@ -8,7 +8,8 @@ Analysis", 2nd ed., sec. 6.4.3) is
 
 lambda and mu are Lame's constants, F is the deformation gradient, and J its determinant. The first
 Piola-Kirchhoff stress is P = mu F + (lambda ln J - mu) F^-T. For small strains, it reduces to
-Hooke's law. The energy grows without bound as J -> 0, so no element inverts at finite energy.
+Hooke's law. The energy becomes infinite as J approaches 0, so no element is inverted if the energy
+is finite.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
 
 
 class InvertedElementError(FlexsheetError, ArithmeticError):
-    """Raised for a displacement that inverts an element."""
+    """Raised if a displacement inverts an element of the mesh."""
 
     code = "inverted-element"
     remedy = "Use smaller load steps. Deep pushes may have no solution."

@@ -26,7 +26,7 @@ NO_CHILDREN: tuple[int, ...] = ()
 
 
 class IndefiniteError(FlexsheetError, ArithmeticError):
-    """Raised for a stiffness matrix that is not positive definite."""
+    """Raised if a stiffness matrix is not positive definite."""
 
     code = "indefinite"
     remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."

@@ -125,7 +125,7 @@ class ResponseBudget:
 def compute_budget(
     mesh: SolidMesh, order: NestedDissection, loads_per_node: int = 1
 ) -> ResponseBudget:
-    """Return the resources of a precomputation with a given mesh and elimination order.
+    """Return the resources that a precomputation with a given mesh and elimination order needs.
 
     loads_per_node: number of unit forces on each touchable node.
     """
@@ -138,7 +138,8 @@ def compute_budget(
 
 
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
-    """Estimate the resources of a precomputation within a factor of two, without building the mesh.
+    """Estimate the resources that a precomputation needs. The mesh is not built, and the error is
+    at most a factor of two.
 
     Raises UnfitMeshError if the skin spacing does not fit the object or requires too many nodes.
     """

@@ -80,7 +80,7 @@ class TableSpec:
 def local_processes(count: int) -> Iterator[Executor]:
     """Yield an executor with `count` processes on this computer.
 
-    If the context exits with an exception, the processes stop without finishing their jobs.
+    If the context exits with an exception, the processes stop and do not finish their jobs.
     """
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
@@ -108,8 +108,8 @@ def _init_worker(stop: Event) -> None:
 def _exit_on(stop: Event) -> None:
     """Exit the worker process as soon as the event `stop` is set.
 
-    This is necessary because a job checks for a stop only after each push depth, which may take a
-    minute. The parent process stores finished results.
+    This is necessary because a job checks only after each push depth whether it must stop. One push
+    depth can take a minute. The parent process stores finished results.
     """
     stop.wait()
     os._exit(0)

@@ -1,7 +1,7 @@
 """Load the pushes (snapshots) of the coarse table that the package contains for some scenes.
 
-For these scenes, the coarse table is available without a long computation. The files are in the
-folder `pushes`, and are named by the key of the table. The command `python -m
+For these scenes, no long computation is necessary before the coarse table is available. The files
+are in the folder `pushes`, and are named by the key of the table. The command `python -m
 benchmarks.ship_pushes` writes them. The key changes if any input of the pushes changes, so an
 outdated file is not used.
 """

@@ -217,7 +217,8 @@ class SnapshotSet:
 def place_snapshots(
     samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
 ) -> list[PlacedSnapshot]:
-    """Return the snapshots and their mirror images, without duplicates on planes of symmetry.
+    """Return the snapshots and their mirror images. A snapshot on a plane of symmetry is not
+    duplicated.
 
     mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
     """

@@ -97,8 +97,8 @@ class Snapshot:
     rest (s, 3): undeformed positions of the s skin nodes, m. faces (f, 6): six-node triangles of
     the skin. depths_m (k,): push depths. moved (k, s, 3): displacement (m) of the s skin nodes at
     these k depths. force_n (k, 3): force on the finger for a Young's modulus of 1 Pa. reached:
-    number of converged depths. At depths without convergence, the entries repeat the last converged
-    solution.
+    number of converged depths. At depths for which no solution converged, the entries repeat the
+    last converged solution.
     """
 
     rest: Floats

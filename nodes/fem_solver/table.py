@@ -233,8 +233,8 @@ def compute_force_factors(
     too large. Each factor is an estimate of the true force divided by the force in the table at the
     same point. fine: sample point and snapshot of a push on a fine mesh. The estimate is a
     Richardson extrapolation of order 2 from the table's mesh and the fine mesh. At depths where the
-    table contains the linear response, the estimate is the force on the fine mesh. At larger depths
-    than those of the push on the fine mesh, the factor is constant.
+    table contains the linear response, the estimate is the force on the fine mesh. Beyond the
+    maximum depth of the push on the fine mesh, the factor is constant.
     """
     sample, push = fine
     solved_m = push.depths_m[: push.reached]

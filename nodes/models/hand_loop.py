@@ -102,12 +102,13 @@ class SampledLoop:
 
 
 def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[float, float]:
-    """Return the gains (alpha, beta) of the alpha-beta filter of the finger's depth for a step of
-    `step_s`.
+    """Return the gains alpha and beta of the filter that smooths the finger's depth.
 
     The filter has the poles of a continuous filter with the damping ratio `FILTER_DAMPING_RATIO`.
     If the bandwidth is infinite, the filter returns the measured depth and the rate of its last
     change.
+
+    step_s: time between two measurements.
     """
     if math.isinf(bandwidth_rad_per_s):
         return 1.0, 1.0
@@ -230,7 +231,8 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) at which the sheet may move towards the finger.
+        """Return the maximum slopes (n,) at which the control loop is stable if the sheet moves
+        towards the finger.
 
         A slope is the sheet offset divided by the finger depth.
 
@@ -239,7 +241,8 @@ class OffsetBounds:
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) at which the sheet may move away from the finger.
+        """Return the maximum slopes (n,) at which the control loop is stable if the sheet moves
+        away from the finger.
 
         A slope is the sheet offset divided by the finger depth.
 

@@ -188,7 +188,7 @@ def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Fl
 
 
 def angle_between(a: Floats, b: Floats) -> float:
-    """Return the angle (rad, 0 to pi) between two vectors (3,), accurate for small angles."""
+    """Return the angle (rad, 0 to pi) between two vectors (3,). Small angles are also accurate."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     across = hypot(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     return atan2(across, ax * bx + ay * by + az * bz)

@@ -82,7 +82,7 @@ class LagBounds:
     max_s: float
 
     def clip(self, lag_s: float) -> float:
-        """Return `lag_s`, limited to the minimum and maximum."""
+        """Return `lag_s`, limited to the range between the minimum and the maximum."""
         return min(max(lag_s, self.min_s), self.max_s)
 
 

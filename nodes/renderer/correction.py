@@ -128,7 +128,7 @@ def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
 def pixel_from_screen(lens: Lens, world_from_projector: Floats) -> Floats:
     """Return the homography (3, 3) from (x, y, 1), in m, on the plane z = 0 to projector pixels.
 
-    The projector is modelled as a pinhole, without lens distortion. world_from_projector (4, 4):
+    The projector is modelled as a pinhole that has no lens distortion. world_from_projector (4, 4):
     pose of the projector.
     """
     projector_from_world = inverse(world_from_projector)

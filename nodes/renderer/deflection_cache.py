@@ -152,9 +152,8 @@ def load_or_compute(
 ) -> IndentationBasis:
     """Load the scene's deflection shapes from the cache, or compute and store them.
 
-    The computation uses all cores. cache_dir: folder of the cache; None selects the cache of the
-    user.
-    progress: function that receives the number of solved pushes and the total number.
+    The computation uses all cores. cache_dir: folder of the cache. If it is None, the cache of the
+    user is used. progress: function that receives the number of solved pushes and the total number.
     """
     return _combine(
         scene,

@@ -54,7 +54,7 @@ class EyeView:
     eye, projector: positions (3,), world frame, m. screen: shape of the sheet for which the image
     is corrected, or None if the image is not corrected. clip_from_screen: matrix (3, 3) from the
     imaginary screen, the plane z = 0, to OpenGL clip coordinates. lens: lens of the projector, or
-    None if the lens has no distortion. grey: whether to draw without colour.
+    None if the lens has no distortion. grey: whether to draw in shades of grey.
     """
 
     eye: Floats
@@ -69,7 +69,7 @@ class EyeView:
 class DrawStyle:
     """The style in which the object is drawn.
 
-    flat: whether to draw without shading. pattern: name of a test pattern, or "object".
+    flat: whether to draw the object unshaded. pattern: name of a test pattern, or "object".
     fingertip_mark, target_mark: points (3,) on the undeformed object, world frame, m, at which
     marks are drawn. None means that the mark is not drawn.
     """
@@ -187,7 +187,7 @@ class Canvas:
     def set_shape(self, moved: Singles) -> None:
         """Set the current positions (m) and normals of the object's vertices, as an array (n, 6).
 
-        The normals may have any length. Raises ValueError if the array has another shape.
+        The normals can have any length. Raises ValueError if the array has another shape.
         """
         self._object.move(moved)
 

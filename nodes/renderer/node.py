@@ -141,7 +141,7 @@ class Renderer(Node):
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
-        """Publish a frame that the window has shown. Any thread may call this method."""
+        """Publish a frame that the window has shown. Any thread is allowed to call this method."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
     def _reopen(self) -> None:

@@ -133,7 +133,7 @@ class Presenter:
     def _next(self) -> tuple[Slot, bool] | None:
         """Wait for the next slot to show.
 
-        Return the slot and whether it is new, or None after a call of `stop`.
+        Return the slot and whether the slot is new. Return None if `stop` was called.
         """
         with self._changed:
             while not self._stop:

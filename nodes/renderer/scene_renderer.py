@@ -65,8 +65,8 @@ smooth.
 """
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""The margin (m) around the object in the eye's image, and the step (m). The edges of the image are
-at multiples of this step. This prevents flicker of the outline when the object moves."""
+"""The margin (m) around the object in the eye's image, and a step (m). The edges of the image are
+rounded to multiples of this step. This prevents flicker of the outline when the object moves."""
 MAX_WINDOW_M = 0.3
 """The maximum distance (m) of the edges of the drawn rectangle from the centre of the imaginary
 screen."""
@@ -265,11 +265,11 @@ class SceneRenderer:
         """Draw the projector's image. Return an array (height, width, 3) if `read` is true,
         otherwise None.
 
-        eyes (1 or 2, 3): positions of the eyes, world frame, m; None selects the eyes of the scene.
-        If there are two eyes, they share one image. In the mode frame_sequential, there are two
-        images instead, and the image of the left eye is returned. drawn: function that receives the
-        index of each image as soon as the image is in `canvas.resolved`. Raises ValueError if the
-        sheet's pose is not finite.
+        eyes (1 or 2, 3): positions of the eyes, world frame, m. If `eyes` is None, the eyes of the
+        scene are used. If there are two eyes, they share one image. In the mode frame_sequential,
+        there are two images instead, and the image of the left eye is returned. drawn: function
+        that receives the index of each image as soon as the image is in `canvas.resolved`. Raises
+        ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")

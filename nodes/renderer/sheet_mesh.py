@@ -63,7 +63,7 @@ def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
 
 
 def refine_mesh(mesh: SheetMesh) -> SheetMesh:
-    """Halve the edges of a mesh `HALVINGS` times without changing its surface.
+    """Halve the edges of a mesh `HALVINGS` times. The surface of the mesh does not change.
 
     The lens distortion is applied only at vertices, so a finer mesh is more accurate.
     """

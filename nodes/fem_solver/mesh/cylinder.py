@@ -42,7 +42,7 @@ class Focus:
 
     x_m: position along the axis. angle_rad: angle from +z. near_m: distance within which elements
     have the requested size. growth: increase of the element size per distance beyond `near_m`
-    (m/m); None selects `FOCUS_GROWTH`.
+    (m/m). If it is None, `FOCUS_GROWTH` is used.
     """
 
     x_m: float
@@ -308,8 +308,8 @@ def _triangles(points: Floats, where: Floats) -> Ints:
     """Triangulate points, and return counter-clockwise triangles (t, 3) of point indices.
 
     points (n, 2): true positions. where (n, 2): positions from which the Delaunay triangulation
-    selects the connected points. These positions can differ from `points`. Triangles without area
-    are omitted.
+    selects the connected points. These positions can differ from `points`. Triangles whose area is
+    zero are omitted.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 

@@ -48,7 +48,7 @@ CORE_DEPTH_RATIO = 0.4
 """The minimum depth of a core (interior) vertex below the surface, divided by the length of the
 shortest edge at this vertex."""
 MAX_THINNED_FRACTION = 0.05
-"""The maximum fraction of core (interior) vertices that may be removed. If more are removed, the
+"""The maximum fraction of core (interior) vertices that are removed. If more must be removed, the
 object is too thin."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
@@ -71,8 +71,8 @@ class _SurfaceCache:
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
         """Return signed distances (n,), m, surface normals (n, 3) and surface curvatures (n,), 1/m.
 
-        The signed distances are those of the n lattice vertices (n, 3) from the surface. Normals
-        and curvatures are evaluated at the surface points nearest to the vertices.
+        A signed distance is the distance of a lattice vertex from the surface. Normals and
+        curvatures are evaluated at the surface points nearest to the vertices.
         """
         keys = [vertex.tobytes() for vertex in vertices]
         new = [i for i, key in enumerate(keys) if key not in self._row_numbers]

@@ -27,7 +27,7 @@ SAME_M = 1e-9
 
 
 class UnfitMeshError(FlexsheetError, ValueError):
-    """Raised for an object that cannot be meshed as specified."""
+    """Raised if an object cannot be meshed as specified."""
 
     code = "unfit-mesh"
     remedy = "Choose a coarser or finer spacing, or repair the surface."

@@ -319,13 +319,16 @@ class RoundedBoxShape(Convex):
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,), m, of the box without its rounding (the core)."""
+        """Return the half extents (3,), m, of the core. The core is the box between the centres of
+        curvature of the rounded edges.
+        """
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Return the face of the core that is nearest to each query (n, 3) inside the core.
+        """Return the face of the core that is nearest to each query (n, 3) inside the core. The
+        core is the box between the centres of curvature of the rounded edges.
 
         before: previous nearest points (n, 3), or None if there are none. Only faces that contain
             these points are considered. If there are none and several faces are equally near, the

@@ -57,7 +57,7 @@ class Nearest:
     undecided: Bools
 
     def reshape(self, shape: tuple[int, ...]) -> Nearest:
-        """Return a copy of results with n rows, reshaped to queries of the shape (3,) or (n, 3)."""
+        """Return a copy of the results whose arrays match queries of the shape (3,) or (n, 3)."""
         return Nearest(
             self.point.reshape(shape),
             self.normal.reshape(shape),
@@ -74,11 +74,11 @@ class Shape(Protocol):
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Find the touchable surface points that are nearest to `points`.
 
-        previous: nearest points of the previous queries, with the shape of `points`; None for a new
-            contact. The results are then continuous over time: the search returns the local minimum
-            of the distance that continues the previous point, as long as this minimum exists.
-            Another surface point can be equally near. Inside the object, another point can even be
-            nearer.
+        previous: nearest points of the previous queries, with the shape of `points`; None if the
+            contact is new. If previous points are given, the results are continuous over time. The
+            search then returns the local minimum of the distance that continues the previous point,
+            as long as this minimum exists. Another surface point can be equally near. Inside the
+            object, another point can even be nearer.
 
         Raises ValueError if a coordinate is not finite or exceeds `MAX_QUERY_M`, or if the shape of
         the array is neither (3,) nor (n, 3).

@@ -27,7 +27,7 @@ MAX_DIHEDRAL_RAD = np.radians(175.0)
 
 
 class MeshError(FlexsheetError, ValueError):
-    """Raised for a mesh that is not the surface of a solid."""
+    """Raised if a mesh is not the surface of a solid."""
 
     code = "mesh"
     remedy = (

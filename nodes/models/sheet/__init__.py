@@ -1,4 +1,4 @@
-"""Provide models of the poses of the rubber sheet's edges, of its shape and of its forces.
+"""Provide models of the rubber sheet: the poses of the sheet's edges, the shape and the forces.
 
 The sheet frame has its origin at the centre. The x axis points from the left to the right clamped
 edge, y points along the edges, and z points towards the user. The functions convert between the

@@ -80,7 +80,7 @@ class IndentationBasis:
     def offsets(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> Floats:
-        """Return displacements (rows, columns, 3), m, relative to the flat, uniformly stretched
+        """Return the displacements (rows, columns, 3), m, of grid points from the flat stretched
         sheet.
 
         position_m: (x, y) of the fingertip in the sheet frame. Rows are along y and columns along

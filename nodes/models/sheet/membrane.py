@@ -264,7 +264,7 @@ class _Grid:
         free coordinates.
 
         added (nodes, 3, 3): stiffness of the contact, N/m.
-        free (3 nodes,): whether each coordinate may move.
+        free (3 nodes,): whether each coordinate of the nodes is free to move.
         damping: value (N/m) that is added to the diagonal.
         """
         deformed, c = self.strain(positions)
