@@ -195,7 +195,8 @@ def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> F
 
 
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Return the angles (n,), in rad, of points on an arc from `start` to `stop`, without `stop`.
+    """Return the angles (n,), in rad, of points on an arc from `start` to `stop`. The end is
+    excluded.
 
     The distances between the points are the required element sizes. radius: radius of the arc, m.
     depth: depth (m) of the arc below the curved side.

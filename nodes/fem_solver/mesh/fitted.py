@@ -4,10 +4,11 @@ The method follows Molino, Bridson, Teran, Fedkiw ("A crystalline, red green str
 highly deformable objects with tetrahedra", 2003), on a bisected lattice:
 
 1. Lattice tetrahedra are bisected to the required sizes, and to smaller sizes where the surface is
-sharply curved.
+    sharply curved.
 2. Lattice vertices that are deep enough inside the surface form the core. All tetrahedra with a
-core vertex are used. Therefore every tetrahedron has a corner inside and at most one boundary face.
-If the boundary touches itself in an edge or a vertex (a pinch), vertices are removed from the core.
+    core vertex are used. Therefore every tetrahedron has a corner inside and at most one boundary
+    face. If the boundary touches itself in an edge or a vertex (a pinch), vertices are removed from
+    the core.
 3. The boundary is moved to the surface while the element shapes are optimized (`smoothing`).
 
 The method is deterministic. Parts thinner than the smallest elements are omitted.
@@ -58,7 +59,7 @@ best fit is used."""
 
 
 class _SurfaceCache:
-    """A cache of the distance, normal and curvature of the surface at lattice vertices."""
+    """A cache of the surface's distance, normal and curvature for each lattice vertex."""
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m

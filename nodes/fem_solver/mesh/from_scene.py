@@ -49,7 +49,7 @@ TOUCH_MARGIN_RAD = 0.45
 """The angle by which the touchable skin extends beyond the maximum sheet tilt of the working range.
 """
 SLAB_DEPTHS = 2.0
-"""The depth of the slab that represents a half-space, divided by the push depth of the scene."""
+"""The depth of the slab that represents a half-space, divided by the scene's maximum push depth."""
 MIN_THICKNESS_SPACINGS = 4.0
 """The minimum thickness of the object, in skin spacings. This thickness corresponds to two
 elements."""
@@ -64,7 +64,7 @@ CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
 """The measured ratio of the actual to the estimated number of nodes, for a cylinder and for a mesh
 file. `INNER_FACTOR` and `SKIN_FACTOR` apply to inner nodes and skin nodes before these factors."""
 MAX_LOST_FRACTION = 0.1
-"""The maximum fraction of an object's volume that its mesh may omit."""
+"""The maximum fraction of an object's volume that the mesh is allowed to omit."""
 
 
 @dataclass(frozen=True, slots=True)

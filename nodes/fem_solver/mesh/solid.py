@@ -37,12 +37,12 @@ class UnfitMeshError(FlexsheetError, ValueError):
 class SolidMesh:
     """A solid mesh of 10-node tetrahedra.
 
-    nodes (n, 3): positions, m, mesh frame. elements (e, 10): node indices. fixed (n,): whether each
-    node is fixed. skin (s,): indices of the nodes on the surface. skin_triangles (t, 3): indices
-    into `skin`, ordered for outward normals. contact_nodes (m,): sorted indices of the nodes on the
-    skin that the finger can touch. contact_normals (m, 3): outward normals at these nodes.
-    contact_faces (f, 6): six-node triangles as indices into `contact_nodes`, ordered for outward
-    normals.
+    nodes (n, 3): positions of the n nodes, m, mesh frame. elements (e, 10): node indices. fixed
+    (n,): whether each node is fixed. skin (s,): indices of the nodes on the surface. skin_triangles
+    (t, 3): indices into `skin`, ordered for outward normals. contact_nodes (m,): sorted indices of
+    the nodes on the skin that the finger can touch. contact_normals (m, 3): outward normals at
+    these nodes. contact_faces (f, 6): six-node triangles as indices into `contact_nodes`, ordered
+    for outward normals.
     """
 
     nodes: Floats

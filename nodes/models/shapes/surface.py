@@ -203,8 +203,8 @@ class SurfaceProjections:
 
     point, normal (n, 3): surface points, m, and unit normals.
     shape_operator (n, 3, 3): shape operators, 1/m.
-    steepness (n,): length of the gradient of the `LevelSet`. support (n,): support of the
-    `LevelSet`.
+    steepness (n,): length of the gradient of the `LevelSet`.
+    support (n,): support of the `LevelSet` at each point.
     is_nearest (n,): whether the projection converged to a local minimum of the distance.
     """
 
