@@ -2,9 +2,9 @@
 
 The methods are the linear method, the nonlinear table, and Newton's method. The references are full
 Newton solutions of one push on separate, finer meshes. At each push depth, the reference is the
-finest mesh with a converged solution. The difference from the second finest mesh is taken as the
-uncertainty of the reference. If no solution converged at a depth, the chart shows only the time and
-the maximum displacement of the skin (the surface of the body).
+converged solution on the finest mesh. Its difference from the solution on the second finest mesh is
+the uncertainty of the reference. If no solution converged at a depth, the chart shows only the time
+and the maximum displacement of the skin (the surface of the body).
 """
 
 from __future__ import annotations
@@ -45,17 +45,18 @@ TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
-"""The distances between the skin nodes of two kinds of reference meshes, in order of decreasing
-accuracy. Focused meshes are fine only near the finger, and their spacing is in finger radii. Even
-meshes have the same spacing everywhere, in metres.
+"""The distances between the skin nodes of the reference meshes of two kinds. The finest mesh of
+each kind comes first. Focused meshes are fine only near the finger, and their spacing is in finger
+radii. Even meshes have the same spacing everywhere, in metres.
 """
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
 NEWTON_STEP_M = 1e-4
 SAMPLE_OFFSET_M = np.array([0.004, 0.003, 0.0])
-"""The offset of the pushed point from the point nearest to the user. With this offset, the pushed
-point is not a node of any mesh. A push at a node would favour the methods that use this mesh."""
+"""The offset (m) of the pushed point from the surface point nearest to the user. With this offset,
+the pushed point is not a node of any mesh. A push at a node would favour the methods that use this
+mesh."""
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 RIM_RATIO = 1.5
 """The distance from the push, in finger radii, within which displacement errors are ignored,
@@ -65,8 +66,9 @@ MAX_DISPLACEMENT = "largest_move_mm"
 
 
 class SkinSolution(Protocol):
-    """The interface of a method's result for one push: the displacement (s, 3), m, of the s skin
-    nodes, and the force (3,), N.
+    """The interface of a method's result for one push.
+
+    It consists of the displacement (s, 3), m, of the s skin nodes, and the force (3,), N.
     """
 
     @property
@@ -80,10 +82,10 @@ class SkinSolution(Protocol):
 class SoftBodyBenchmark:
     """A benchmark of the soft-body methods for pushes at one surface point of a scene's object.
 
-    depths_m: push depths. linear_m, table_m: distance between skin nodes (m) by name of the linear
-    or table method. newton_m: depths at which the time of full Newton solutions is measured.
-    focused: skin spacings of the reference meshes that are fine only near the finger, in finger
-    radii. even_m: skin spacings of the even reference meshes, m.
+    depths_m: push depths. linear_m, table_m: distance between skin nodes (m) for each linear method
+    and each table. The keys are the names of the methods. newton_m: depths at which the time of
+    full Newton solutions is measured. focused: skin spacings of the reference meshes that are fine
+    only near the finger, in finger radii. even_m: skin spacings of the even reference meshes, m.
     """
 
     scene: Scene
@@ -96,8 +98,8 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the body with its linear method, and the precomputed model. Both are computed if
-        they are not cached.
+        """Return the body with its linear method, and the precomputed model. If the model is not
+        cached, it is computed.
 
         spacing_m: distance between skin nodes.
         """
@@ -132,8 +134,8 @@ class SoftBodyBenchmark:
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return the names and the jobs of the reference solutions, in order of decreasing
-        accuracy.
+        """Return the name and the job (inputs of the computation) of each reference solution. The
+        most accurate solution comes first.
         """
         body, sample = self.coarsest(), self.sample()
         jobs = []
@@ -147,9 +149,10 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return tables that cover only the skin near the push, by name of the method.
+        """Return tables that cover only the skin near the push. The keys are the names of the
+        methods.
 
-        The result contains the methods whose full table is not cached.
+        A method is included only if its full table is not cached.
         """
         found = {}
         for name, spacing in self.table_m.items():
@@ -265,9 +268,9 @@ class ReferenceSet:
     ) -> Trial:
         """Return the trial of a method at one push depth.
 
-        rest (s, 3): undeformed skin nodes, m. run: function that computes the solution. in_range:
-        whether the method is valid at this depth. The error is NaN if no reference converged at the
-        depth.
+        rest (s, 3): undeformed positions of the s skin nodes, m. run: function that computes the
+        solution. in_range: whether the method is valid at this depth. The error is NaN if no
+        reference converged at the depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
         present = [one for one in self._references if one.reaches(depth_m)]
@@ -353,5 +356,6 @@ def _family(methods: Sequence[str], **changes: Any) -> Family:
 SOFT_BODY = _family([*LINEAR_SPACINGS_M, *TABLE_SPACINGS_M, NEWTON])
 SOFT_BODY_LINEAR = _family([*LINEAR_SPACINGS_M], table_m={}, newton_m=())
 SOFT_BODY_TABLES = _family([*TABLE_SPACINGS_M], linear_m={}, newton_m=())
-"""The families of all methods, of the linear methods, and of the nonlinear tables. The linear
-methods need no long precomputation. The tables need minutes."""
+"""The benchmarks of all methods (`SOFT_BODY`), of only the linear methods (`SOFT_BODY_LINEAR`) and
+of only the nonlinear tables (`SOFT_BODY_TABLES`). The precomputation of the tables takes minutes.
+"""

@@ -28,7 +28,7 @@ from flexsheet.nodes.models.shapes import Shape, make_shape
 
 QUICK_TABLE = "quick_table"
 """The name of the method that uses the coarse nonlinear table. This table is computed first, from
-few snapshots."""
+only a few snapshots (precomputed pushes)."""
 ERROR_DEPTHS_M = (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.005)
 _LINEAR_ERRORS = (1.13, 0.76, 0.59, 0.46, 0.32, 0.26)
 FORCE_ERROR_RATIOS = {
@@ -36,11 +36,11 @@ FORCE_ERROR_RATIOS = {
     QUICK_TABLE: ((0.18, 0.10, 0.10, 0.10, 0.10, 0.10), (1.13, 0.76, 0.59, 0.46, 0.22, 0.22)),
     "nonlinear_table": ((0.17, 0.07, 0.03, 0.03, 0.03, 0.03), (1.13, 0.76, 0.15, 0.15, 0.15, 0.15)),
 }
-"""The relative errors of the force that the node states, by method, at the depths `ERROR_DEPTHS_M`.
+"""The relative force errors that the node reports for each method at the depths `ERROR_DEPTHS_M`.
 
 The first row applies to cylinders on a strip support, for which the forces of a table are
 corrected. The second row applies to other bodies, whose tables use the linear response at small
-depths. The errors are valid for 95 % of the touchable nodes, with the demo's finger and a skin
+depths. The errors are valid for 95 % of the touchable nodes, for the finger of the demo and a skin
 spacing of 4.5 mm. The first row was measured by `python -m benchmarks.soft_body --table`.
 The second row is derived from the first row and was not measured.
 """
@@ -49,7 +49,7 @@ NOTED_DEPTHS_M = (0.001, 0.005)
 
 
 def state_force_error_ratio(method: str, mesh: MeshSpec, depth_m: float) -> float:
-    """Return the stated relative error of the force that a method computes at a push depth."""
+    """Return the relative force error that the node reports for a method and a push depth."""
     corrected, uncorrected = FORCE_ERROR_RATIOS[method]
     on_strip = isinstance(mesh.geometry, Cylinder) and isinstance(mesh.support, StripSupport)
     return float(np.interp(depth_m, ERROR_DEPTHS_M, corrected if on_strip else uncorrected))
@@ -83,11 +83,12 @@ def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
 class SceneBody:
     """A soft body of a scene, in its pose in the world.
 
-    method: method that computes the response. shape, spec, skin: surface, inputs and skin mesh.
-    front (3,): surface point nearest to the user, m, mesh frame. world_from_mesh (4, 4): pose of
-    the mesh frame in the world. rest (s, 3): undeformed positions of the s skin nodes, m, mesh
-    frame. linear_depth_m: maximum depth of the linear method, at which the stiffness is evaluated.
-    friction_ratio: friction coefficient; 0 means that the finger slides freely.
+    method: method that computes the response. shape: surface of the body. spec: inputs of the
+    precomputation. skin: skin mesh. front (3,): surface point nearest to the user, m, mesh frame.
+    world_from_mesh (4, 4): pose of the mesh frame in the world. rest (s, 3): undeformed positions
+    of the s skin nodes, m, mesh frame. linear_depth_m: maximum depth of the linear method, at which
+    the stiffness is evaluated. friction_ratio: friction coefficient; 0 means that the finger slides
+    freely.
     """
 
     method: SoftBodyMethod
@@ -105,8 +106,8 @@ class SceneBody:
     ) -> tuple[Response, ContactAnchor | None]:
         """Return the response to a fingertip at `point_world` (3,), m, and the new contact anchor.
 
-        anchor: contact anchor (pushed surface point) that the previous call returned, or None.
-        Raises ValueError if a coordinate of the point is not finite.
+        anchor: contact anchor (pushed surface point) that the previous call returned; None before
+        the first call. Raises ValueError if a coordinate of the point is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:
@@ -128,7 +129,9 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, with the stiffness at the front of the object."""
+        """Return the response if the finger does not touch the object. The stiffness in this
+        response is the stiffness at the front of the object.
+        """
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -139,7 +142,7 @@ class SceneBody:
         )
 
     def force_error_ratio(self, depth_m: float) -> float:
-        """Return the stated relative error of the force at a push depth."""
+        """Return the relative force error that the node reports for a push depth."""
         return state_force_error_ratio(self.method.name, self.spec.mesh, depth_m)
 
     def message(
@@ -230,7 +233,7 @@ def attach_table(
 ) -> SceneBody:
     """Return a copy of the body that uses the nonlinear table as its method.
 
-    quick: whether the table is the coarse table, which is computed from few snapshots.
+    quick: whether the table is the coarse table, which is computed from only a few snapshots.
     """
     method = TableSoftBody(
         model.response,

@@ -15,8 +15,8 @@ from flexsheet.nodes.models.shapes import Shape
 
 MIN_CURVATURE_MARGIN = 0.3
 """The minimum distance of the fingertip from the centre of curvature, divided by the radius of
-curvature. At smaller distances, the nearest point is ill-conditioned, and the anchor is used
-instead."""
+curvature. At smaller distances, the nearest point is ill-conditioned. The previous contact point is
+then used instead."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +50,11 @@ def locate(
 ) -> tuple[ContactQuery, ContactAnchor | None]:
     """Return the contact of a fingertip at `point` (3,), m, and the anchor for the next call.
 
-    anchor: anchor that the previous call returned, or None. The contact point is usually the
-    nearest surface point. It is the anchor if the fingertip is near the centre of curvature. It is
-    also the anchor if the nearest point is on the far side of the body. Therefore a finger that is
-    pushed through a body remains in contact with the side that it entered. Raises ValueError if a
-    coordinate of the point is not finite.
+    anchor: anchor that the previous call returned; None before the first call. The contact point is
+    usually the nearest surface point. In two cases, the anchor is the contact point instead: the
+    fingertip is near the centre of curvature, or the nearest point is on the far side of the body.
+    Therefore a finger that is pushed through a body remains in contact with the side that it
+    entered. Raises ValueError if a coordinate of the point is not finite.
     """
     if not np.isfinite(point).all():
         raise ValueError(
@@ -77,8 +77,9 @@ def locate_sticking(
 ) -> tuple[ContactQuery, ContactAnchor | None]:
     """Return the contact of a sticking fingertip at `point` (3,), m, and the next anchor.
 
-    anchor: first contact point, to which the fingertip sticks, or None before contact. Pass the
-    returned anchor to the next call. Raises ValueError if a coordinate of the point is not finite.
+    anchor: first contact point, to which the fingertip sticks, or None if there is no contact yet.
+    Pass the returned anchor to the next call. Raises ValueError if a coordinate of the point is not
+    finite.
     """
     query, new_anchor = locate(shape, point, anchor)
     if new_anchor is None or anchor is None:
@@ -106,8 +107,10 @@ def slide_anchor(
 def _make_query(
     point: Floats, surface_point: Floats, normal: Floats, on_edge: bool
 ) -> ContactQuery:
-    """Return the contact of a fingertip at `point` (3,) with the tangent plane at a surface point
-    (3,).
+    """Return the contact of a fingertip at `point` (3,) with a tangent plane of the object.
+
+    surface_point, normal (3,): point at which the plane touches the object, and its outward normal.
+    on_edge: whether this point is on the edge of the touchable surface.
     """
     depth = float((surface_point - point) @ normal)
     surface = point + depth * normal

@@ -33,8 +33,8 @@ FLANK_RATIO = 0.9
 """The distance from the push axis, in finger radii, beyond which the spherical fingertip is
 approximated by a tangent cone."""
 FACING = (0.2, 0.6)
-"""The range in which the weight of the penetration rises from 0 to 1. The values are cosines of the
-angle between skin normal and contact normal."""
+"""The range in which the weight of the penetration rises from 0 to 1. The two limits are cosines of
+the angle between skin normal and contact normal."""
 PAD_RATIO = 1.1
 """The half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
@@ -128,7 +128,7 @@ class SoftBodyMethod(Protocol):
         ...
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the displacement of the skin and the force on the finger."""
+        """Compute the displacement of the skin and the force on the finger for a contact."""
         ...
 
 
@@ -302,9 +302,9 @@ class DragContact:
     def solve(self, contact: NormalContact, drag: Floats) -> tuple[Ints, Floats, Floats]:
         """Return the tangential forces of a sticking finger for a given normal contact.
 
-        drag (3,): displacement of the finger since it started to stick, m. For k loaded nodes,
-        return row indices (2k,) of `influence`, the forces (2k,), N, of these rows, and the total
-        force (3,), N, on the finger.
+        drag (3,): displacement of the finger since it started to stick, m. Return row indices (2k,)
+        of `influence` for the k loaded nodes, the forces (2k,), N, for these rows, and the total
+        force (3,), N.
         """
         nodes, count = contact.nodes, len(contact.nodes)
         rows = (2 * nodes[:, None] + np.arange(2)).ravel()
@@ -363,8 +363,9 @@ def _search_step(
 ) -> float:
     """Return the largest fraction (1, 1/2, 1/4...) of a step that decreases the contact energy.
 
-    forces, target (k,): nodal forces (N) at the start and at the end of the full step. problem:
-    compliance, compliance at the contact points, penalty and depths, as in `solve_penalty_contact`.
+    forces, target (k,): forces (N) on k nodes at the start and at the end of the full step.
+    problem: compliance of the nodes, compliance at the contact points, penalty and depths, as in
+    `solve_penalty_contact`.
     """
     compliance, compliance_at_points, penalty, depths = problem
 
@@ -381,8 +382,8 @@ def _search_step(
 class LinearSoftBody:
     """The linear soft-body method: a superposition of precomputed responses to unit forces.
 
-    Pushes deeper than `linear_depth_m` are reported as out of range. For these pushes, the force is
-    proportional to the depth. The displacement stops growing at the depth `max_depth_m`.
+    Pushes deeper than `linear_depth_m` are reported as out of range. For these pushes, the force
+    increases in proportion to the depth. The displacement stops growing at the depth `max_depth_m`.
     """
 
     name = "linear"
@@ -402,10 +403,10 @@ class LinearSoftBody:
     ) -> None:
         """Precompute the force curves of all touchable mesh corners.
 
-        bounds (b, 3): positions of skin nodes that must not be touched. Pushes next to these nodes
-        are reported as out of range. push_depth_m: depth at which the force curve ends; if it is
-        None, the curve ends at `max_depth_m`. drag: tangential response for a sticking finger, or
-        None if there is no friction. Raises ValueError unless 0 < linear_depth_m < max_depth_m.
+        bounds (b, 3): positions of the b skin nodes that must not be touched. Pushes next to these
+        nodes are reported as out of range. push_depth_m: depth at which the force curve ends; if it
+        is None, the curve ends at `max_depth_m`. drag: tangential response for a sticking finger,
+        or None if there is no friction. Raises ValueError unless 0 < linear_depth_m < max_depth_m.
         """
         if not 0.0 < linear_depth_m < max_depth_m:
             raise ValueError(
@@ -501,9 +502,10 @@ class LinearSoftBody:
         return result
 
     def _sum(self, table: Singles, rows: Ints, forces: Floats) -> Singles:
-        """Return the displacement (3s,), m, that several nodal forces cause at s skin nodes.
+        """Return the displacement (3s,), m, that k nodal forces cause at s skin nodes.
 
-        table: influence matrix, m/N. rows, forces (k,): row indices and forces (N).
+        table: influence matrix, m/N. rows (k,): rows of the matrix that belong to the forces.
+        forces (k,): forces, N.
         """
         scaled = (forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)
@@ -521,7 +523,7 @@ def unit_linear_body(
     """Return the linear method for a Young's modulus of 1 Pa and a linear range of one finger
     radius.
 
-    bounds (b, 3): positions of skin nodes that must not be touched.
+    bounds (b, 3): positions of the b skin nodes that must not be touched.
     """
     return LinearSoftBody(
         response,

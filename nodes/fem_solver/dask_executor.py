@@ -23,7 +23,7 @@ untyped: Any = distributed
 CONNECT_S = 10.0
 """The timeout for the connection to a scheduler and for its first worker, in seconds."""
 TRIES = 3
-"""The maximum number of repetitions of a job whose worker was lost."""
+"""The maximum number of times that a job is repeated because its worker was lost."""
 
 
 class SchedulerError(precompute_table.WorkersError):
@@ -56,7 +56,7 @@ class DaskExecutor(Executor):
         """Shut down the executor.
 
         wait: whether to wait for the pending functions. cancel_futures: whether to cancel pending
-        functions and stop running functions, without waiting.
+        functions and stop running functions. In this case, the method does not wait.
         """
         # Workers of a lost scheduler cannot be notified.
         if cancel_futures and self._client.status == "running":
@@ -114,8 +114,9 @@ def _require_same_code(client: distributed.Client, address: str) -> None:
 
 
 def _run_stoppable(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-    """Run a function in a dask worker. The function can query whether a dask event requests a
-    stop.
+    """Run a function in a dask worker. The function can query whether a stop is requested.
+
+    name: name of the dask event that requests the stop.
     """
     stop_event = untyped.Event(name)
     token = precompute_table.stop_requested.set(stop_event.is_set)

@@ -15,14 +15,14 @@ from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 MAX_POISSON_RATIO = 0.4999
-"""The maximum of Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
+"""The maximum Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
 MIN_VOLUME_RATIO = 1e-6
 """The minimum ratio of an element's Jacobian determinant to the cube of its edge length. For
 flatter elements, rounding errors make the solution useless."""
 
 
 class SolidMeshError(FlexsheetError, ValueError):
-    """Raised for a mesh with inverted or flat elements."""
+    """Raised if a mesh contains inverted or flat elements."""
 
     code = "solid-mesh"
     remedy = "Increase skin_spacing_m; see docs/soft-body-reference.md."
@@ -85,17 +85,18 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     """Return the Jacobian matrices (e, q, 3, 3) of e elements at q points, and their determinants
     (e, q).
 
-    The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3), m,
-    elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raises
-    SolidMeshError if an element is inverted or flat, or if the coordinates of a node are not
-    finite.
+    The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3):
+    positions of the n nodes, m. elements (e, 10): node indices. local (q, 10, 3): gradients of the
+    shape functions at q points. Raises SolidMeshError if an element is inverted or flat, or if the
+    coordinates of a node are not finite.
     """
     corners = nodes[elements]
     invalid = ~np.isfinite(corners).all(axis=(1, 2))
     if invalid.any():
         raise SolidMeshError(
             f"{int(invalid.sum())} of {len(elements)} elements have node positions that are not "
-            f"finite; the first of these elements has the index {int(np.argmax(invalid))}"
+            f"finite; the first of these elements has the index {int(np.argmax(invalid))}; "
+            "correct the node positions"
         )
     jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
     determinant: Floats = np.linalg.det(jacobian)
@@ -105,7 +106,7 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
         raise SolidMeshError(
             f"{int(bad.sum())} of {len(elements)} elements are inverted or flat; the first of "
             f"these elements has the index {int(np.argmax(bad))} (minimum determinant "
-            f"{determinant.min():.3g} m^3)"
+            f"{determinant.min():.3g} m^3); repair the mesh"
         )
     return jacobian, determinant
 
@@ -115,8 +116,8 @@ def element_stiffness(
 ) -> Floats:
     """Return the stiffness matrices (e, 30, 30), N/m, of e elements.
 
-    nodes (n, 3), m, elements (e, 10): mesh. Raises SolidMeshError if an element is inverted or
-    flat, and ValueError if the material is invalid.
+    nodes (n, 3): positions of the n nodes, m. elements (e, 10): node indices. Raises SolidMeshError
+    if an element is inverted or flat, and ValueError if the material is invalid.
     """
     lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
     points, weights = quadrature()

@@ -8,7 +8,8 @@ Analysis", 2nd ed., sec. 6.4.3) is
 
 lambda and mu are Lame's constants, F is the deformation gradient, and J its determinant. The first
 Piola-Kirchhoff stress is P = mu F + (lambda ln J - mu) F^-T. For small strains, it reduces to
-Hooke's law. The energy grows without bound as J -> 0, so no element inverts at finite energy.
+Hooke's law. The energy becomes infinite as J approaches 0, so no element is inverted if the energy
+is finite.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
 
 
 class InvertedElementError(FlexsheetError, ArithmeticError):
-    """Raised for a displacement that inverts an element."""
+    """Raised if a displacement inverts an element of the mesh."""
 
     code = "inverted-element"
     remedy = "Use smaller load steps. Deep pushes may have no solution."
@@ -108,10 +109,10 @@ class NeoHookeanSolid:
     def tangents(self, displacement: Floats) -> Floats:
         """Return the tangent stiffness of each element (e, 30, 30), N/m.
 
-        The tangent stiffness is the second derivative of the energy. For the nodes a and b of an
-        element, let g_a and g_b be the gradients of their shape functions, and h = F^-T g. The
-        block of these nodes is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda
-        ln J) h_b h_a^T. displacement (n, 3): displacement of the nodes, m. Raises
+        The tangent stiffness is the second derivative of the energy. Let g_a and g_b be the
+        gradients of the shape functions of two nodes a and b. Let h_a = F^-T g_a and h_b = F^-T
+        g_b. The block of these nodes is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu -
+        lambda ln J) h_b h_a^T. displacement (n, 3): displacement of the nodes, m. Raises
         InvertedElementError if an element is inverted.
         """
         _, inverse, log = self._state(displacement)

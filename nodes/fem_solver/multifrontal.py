@@ -26,7 +26,7 @@ NO_CHILDREN: tuple[int, ...] = ()
 
 
 class IndefiniteError(FlexsheetError, ArithmeticError):
-    """Raised for a stiffness matrix that is not positive definite."""
+    """Raised if a stiffness matrix is not positive definite."""
 
     code = "indefinite"
     remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."
@@ -39,8 +39,8 @@ class Front:
     pivots: degrees of freedom that are eliminated in this front. boundary: degrees of freedom that
     the parent eliminates. elements: indices of the elements; empty unless the front is a leaf.
     scatter: position in the dense matrix for each entry of the element matrices. Entries of fixed
-    nodes have a position past the end of the matrix. children: indices of earlier fronts, and the
-    positions of their boundaries in this front.
+    nodes have a position past the end of the matrix. children: for each child front, its index and
+    the positions of its boundary in this front.
     """
 
     pivots: Ints
@@ -59,8 +59,7 @@ class Factors:
     off_diagonal: list[Floats]
 
     def solve(self, loads: Floats) -> Floats:
-        """Return the displacements of n nodes under loads (3n,) or (3n, k) on their degrees of
-        freedom.
+        """Return the displacements of n nodes for one load vector (3n,) or k load vectors (3n, k).
 
         The result has the shape of the loads and is 0 at fixed nodes.
         """
@@ -105,7 +104,8 @@ class NestedDissection:
     def __init__(self, nodes: Floats, elements: Ints, fixed: Bools) -> None:
         """Compute the elimination order.
 
-        nodes (n, 3), m, elements (e, k): mesh. fixed (n,): whether each node is fixed.
+        nodes (n, 3): positions of the n nodes, m. elements (e, k): indices of the k nodes of each
+        element. fixed (n,): whether each node is fixed.
         """
         self._elements, self._fixed = elements, fixed
         self._centres = nodes[elements].mean(axis=1)
@@ -129,7 +129,7 @@ class NestedDissection:
         self.fronts = [self._front(part) for part in self._parts]
 
     def factor(self, matrices: Floats) -> Factors:
-        """Factor the stiffness matrix that is the sum of symmetric element matrices (e, 3k, 3k).
+        """Factor the stiffness matrix that e symmetric element matrices (e, 3k, 3k) add up to.
 
         float32 matrices need half of the time and memory of float64 matrices, but their
         solutions have only about four digits. Raises IndefiniteError if the sum is not positive
@@ -172,8 +172,9 @@ class NestedDissection:
     def _split(self, members: Ints) -> tuple[int, Ints, Ints]:
         """Divide elements recursively, and append each part after its halves to the list of parts.
 
-        members: indices of the elements. Return the index of the last part, the free nodes (k,) of
-        this part, and the number of elements of the part at each of these nodes (k,).
+        members: indices of the elements. Return the index of the last part, its k free nodes (k,),
+        and a count (k,) for each of these nodes. The count is the number of elements in the part
+        that contain the node.
         """
         if len(members) <= LEAF_ELEMENTS:
             present, counts = np.unique(self._elements[members], return_counts=True)

@@ -30,7 +30,7 @@ from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, Ne
 PENALTY_RATIO = 200.0
 """The penalty stiffness (Pa/m) of the contact, divided by Young's modulus per finger radius."""
 ROUNDING_RATIO = 0.005
-"""The penetration up to which the penalty pressure rises quadratically, in finger radii."""
+"""The penetration, in finger radii, up to which the penalty pressure rises quadratically."""
 POINTS_PER_EDGE = 4
 MAX_STEP_RATIO = 0.35
 """The maximum displacement of the finger per load step, in finger radii."""
@@ -87,10 +87,9 @@ class FingerObstacle:
         """Distribute the contact points over the faces.
 
         faces (f, 6): six-node triangles that the finger can touch. modulus_pa: Young's modulus of
-            the body, to which the contact stiffness is proportional. radius_m: radius of the
-            finger.
-        axis (3,): unit vector from the tip of the finger along its shaft, which is a cylinder of
-            the same radius; None if the finger is a sphere.
+        the body. The contact stiffness is proportional to it. radius_m: radius of the finger. axis
+        (3,): unit vector from the tip of the finger along its shaft, which is a cylinder of the
+        same radius; None if the finger is a sphere.
         """
         self.radius_m, self._axis = radius_m, axis
         self._count, self._faces = len(nodes), faces
@@ -115,8 +114,9 @@ class FingerObstacle:
         """Find the contact points inside the finger.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere that models the fingertip, m.
-        Return four arrays for k points: indices (k,), penetrations (k,), m, outward normals of the
-        finger (k, 3), and distances from the centre or the axis of the shaft (k,), m.
+        Return four arrays for the k points inside: indices (k,), penetrations (k,), m, outward
+        normals (k, 3) of the finger, and distances (k,), m, from the centre or from the axis of the
+        shaft.
         """
         offset = self.points(positions) - centre
         if self._axis is not None:
@@ -138,7 +138,8 @@ class FingerObstacle:
         return float(self._penalty[inner] @ density)
 
     def forces(self, positions: Floats, centre: Floats) -> Floats:
-        """Return the force (n, 3), N, of each node on the finger: the gradient of the energy.
+        """Return the force (n, 3), N, that each node exerts on the finger: the gradient of the
+        energy.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere that models the fingertip, m.
         """
@@ -163,8 +164,9 @@ class FingerObstacle:
         """Add the contact stiffness to the element matrices (e, 30, 30), in place.
 
         The contact stiffness is the second derivative of the contact energy.
-        geometric_stiffness_weight: 1 for the exact derivative. A smaller weight reduces the part
-        that results from the curvature of the finger and can make the stiffness indefinite.
+        geometric_stiffness_weight: weight of the part of the stiffness that results from the
+        curvature of the finger. This part can make the stiffness indefinite. The derivative is
+        exact if the weight is 1.
         """
         inner, depth, normals, away = self.inside(positions, centre)
         slope = np.where(depth < self._rounding, depth / self._rounding, 1.0)
@@ -216,15 +218,15 @@ class NeoHookeanBody:
     ) -> None:
         """Prepare the solver for a mesh and a material.
 
-        nodes (n, 3), elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
-            six-node triangles that the finger can touch, with outward normals. tolerance: maximum
-            residual force, relative to the largest nodal force. min_step_fraction: minimum fraction
-            of a load step. max_step_ratio: maximum load step, in finger radii. factor_dtype:
-            precision of the factors of the tangent stiffness; it affects only the search direction.
-        mirror_axes: axes of planes of symmetry if the mesh contains only one side of these planes.
-            Then the forces contain only the contribution of this side. finger_axis (3,): direction
-            of the finger's shaft; None if the finger is a sphere. Raises SolidMeshError if an
-            element is inverted, and ValueError if the material is invalid.
+        nodes (n, 3): positions of the n nodes, m. elements (e, 10): node indices. fixed (n,):
+        whether each node is fixed. faces (f, 6): six-node triangles that the finger can touch, with
+        outward normals. tolerance: maximum residual force, relative to the largest nodal force.
+        min_step_fraction: minimum fraction of a load step. max_step_ratio: maximum load step, in
+        finger radii. factor_dtype: precision of the factors of the tangent stiffness; it affects
+        only the search direction. mirror_axes: axes of the planes of symmetry if the mesh contains
+        only one side of them. In this case, the forces contain only the contribution of this side.
+        finger_axis (3,): direction of the finger's shaft; None if the finger is a sphere. Raises
+        SolidMeshError if an element is inverted, and ValueError if the material is invalid.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
@@ -255,13 +257,14 @@ class NeoHookeanBody:
     def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
     ) -> Iterator[EquilibriumState]:
-        """Move the finger to each centre (3,) in a straight line, and yield the equilibria.
+        """Move the finger in a straight line to each centre (3,), m, and yield the equilibrium
+        there.
 
         start: displacement (n, 3) of the nodes and centre (3,) of the spherical fingertip in a
-        known equilibrium, m. If it is None, the sphere at the first centre must not touch the body.
-        If a step does not converge, the last equilibrium is yielded with `reached` false for all
-        remaining centres. A step with inverted elements or with the sphere inside the body has not
-        converged. Raises ValueError if a coordinate of a centre is not finite.
+        known equilibrium, m. If `start` is None, the sphere at the first centre must not touch the
+        body. If a step does not converge, the last equilibrium is yielded with `reached` false for
+        all remaining centres. A step with inverted elements or with the sphere inside the body has
+        not converged. Raises ValueError if a coordinate of a centre is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
@@ -365,8 +368,8 @@ class NeoHookeanBody:
         target: Floats,
         factors: Factors | None,
     ) -> Floats:
-        """Predict the displacement (n, 3), m, to first order after a motion of the finger to
-        `target` (3,).
+        """Predict the displacement (n, 3), m, to first order for a finger that moves to `target`
+        (3,).
         """
         if factors is None:
             return displacement
@@ -417,7 +420,7 @@ def winding_number(triangles: Floats) -> float:
 
 
 def _find_parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:
-    """Find the element of each face (f, 6).
+    """Find the element to which each of the f faces (f, 6) belongs.
 
     Return the indices (f,) of the elements, and the local indices (f, 6), from 0 to 9, of the face
     nodes in their element.

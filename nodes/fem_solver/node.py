@@ -80,8 +80,8 @@ class FemSolver(Node):
         self._anchor: ContactAnchor | None = None
 
     def _set_bodies(self, bodies: list[body.SceneBody]) -> None:
-        """Set the soft bodies that compute responses, and start a gradual transition to their
-        responses.
+        """Set the soft bodies that compute responses, and start a gradual transition to these
+        bodies.
 
         bodies: one body per method, of which the first is the best; an empty list if there is no
             scene yet.
@@ -96,7 +96,9 @@ class FemSolver(Node):
             self.note = f"soft body by {self._describe(bodies[0])}"
 
     def _describe(self, current: body.SceneBody) -> str:
-        """Return a text with the current method, the force error, and the number of skin nodes."""
+        """Return a text that states the current method, its force error and the number of skin
+        nodes.
+        """
         nodes = len(current.skin.vertices_world_m)
         bodies = (current, *(old for old, _ in self._replaced))
         errors = " and ".join(
@@ -153,7 +155,7 @@ class FemSolver(Node):
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
         """Compute the nonlinear table in the background, and use it when it is finished.
 
-        Until then, the linear method, and later a coarse table, computes the responses.
+        Until then, the linear method computes the responses, and later a coarse table.
         """
         loop = asyncio.get_running_loop()
         stop = self._stop
@@ -250,12 +252,12 @@ async def run_unless_superseded(
     progress: Callable[..., None],
     is_superseded: Callable[[], bool],
 ) -> T:
-    """Run a function in a thread, and return its result.
+    """Run a function in a thread, and return the result unless a newer request arrives.
 
-    compute: function that receives a progress callback. progress: the same callback, but with a
-    stop event as an additional first argument. is_superseded: function that returns whether a newer
-    request has arrived. Raises Interrupted if a newer request arrives. The thread then ends later,
-    and its errors are ignored.
+    compute: function that is run. Its argument is a progress callback. progress: function that the
+    callback calls with a stop event as an additional first argument. is_superseded: function that
+    returns whether a newer request has arrived. Raises Interrupted if a newer request arrives. The
+    thread then ends later, and its errors are ignored.
     """
     stop = Event()
     task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))

@@ -38,19 +38,19 @@ VERSION = 3
 CHUNK_LOADS = 128
 ELEMENT_BYTES = 30 * 30 * 8
 MESH_STEPS, FACTOR_STEPS = 1, 4
-"""The approximate durations of meshing and of factoring the stiffness matrix, in units of the
-duration of one load. They are used for progress reports."""
+"""The approximate durations of two steps: meshing, and factoring the stiffness matrix. They are
+used for progress reports, in units of the time that one unit force needs."""
 
 Progress = Callable[[int, int, str], None]
-"""A callback that receives the number of finished steps, the total number, and a text about the
-required resources. The first call is before the work starts. The callback may raise `Interrupted`
-to stop the work."""
+"""A callback that receives the number of finished steps, the total number of steps, and a text
+about the required resources. The first call is before the work starts. The callback may raise
+`Interrupted` to stop the work."""
 
 
 class Interrupted(Exception):
     """Raised when a computation is stopped on request.
 
-    Finished parts remain stored.
+    The finished parts of the computation remain stored.
     """
 
 
@@ -75,7 +75,7 @@ class SoftBodySpec:
         return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
 
     def key(self) -> str:
-        """Return a digest of the inputs and of `VERSION`, as an identifier of the result."""
+        """Return a digest of the inputs and of `VERSION`, which identifies the result."""
         return make_digest(self.depends_on())
 
 
@@ -84,8 +84,8 @@ class SoftBodyModel:
     """The precomputed elastic response of a soft body and its skin mesh.
 
     response: response to normal forces. triangles (t, 3): skin triangles with outward normals.
-    bounds (s,): for each skin node, true for nodes of the curved surface that the finger must not
-    touch, and false for nodes on end faces. drag: response to tangential forces, or None.
+    bounds (s,): whether the finger must not touch each of the s skin nodes; false for nodes on end
+    faces. drag: response to tangential forces; None if the finger does not stick to the skin.
     """
 
     response: SkinResponse
@@ -98,8 +98,8 @@ class SoftBodyModel:
 class ResponseBudget:
     """An estimate of the resources that a precomputation needs.
 
-    loads: number of unit forces. working_bytes, table_bytes: memory for the computation and for its
-    results.
+    loads: number of unit forces. working_bytes: memory that the computation needs. table_bytes:
+    memory that the results need.
     """
 
     skin_nodes: int
@@ -125,7 +125,7 @@ class ResponseBudget:
 def compute_budget(
     mesh: SolidMesh, order: NestedDissection, loads_per_node: int = 1
 ) -> ResponseBudget:
-    """Return the resources of a precomputation with a given mesh and elimination order.
+    """Return the resources that a precomputation with a given mesh and elimination order needs.
 
     loads_per_node: number of unit forces on each touchable node.
     """
@@ -138,7 +138,8 @@ def compute_budget(
 
 
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
-    """Estimate the resources of a precomputation within a factor of two, without building the mesh.
+    """Estimate the resources that a precomputation needs. The mesh is not built, and the error is
+    at most a factor of two.
 
     Raises UnfitMeshError if the skin spacing does not fit the object or requires too many nodes.
     """
@@ -236,9 +237,10 @@ def _solve_unit_loads(
     """Compute the displacements for unit forces in p directions on each of m contact nodes.
 
     directions (m, p, 3): unit vectors. get_part: function that loads the stored part with an index,
-    or computes and stores it. advance: function that receives the number of newly finished loads.
-    Return the displacements per force, m/N. The first array (m p, 3s) is for the s skin nodes. The
-    second array (m p, m p) is for the contact nodes along each direction.
+    or computes and stores it. advance: function that receives the number of newly finished unit
+    forces. Return the displacements per force, m/N. The first array (m p, 3s) contains the
+    displacements of the s skin nodes. The second array (m p, m p) contains the displacements of the
+    contact nodes along each direction.
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -278,8 +280,8 @@ def make_tangents(normals: Floats) -> Floats:
 def require_memory(required_bytes: int, what: str, remedy: str) -> None:
     """Raise MemoryError if the computer has less free memory than required.
 
-    what: name, in the error text, of the computation that needs the memory. remedy: advice in the
-    error text.
+    what: name of the computation that needs the memory. remedy: advice to the user. Both are parts
+    of the error text.
     """
     import psutil
 
@@ -292,7 +294,8 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""The names of some arrays in the cache file, by field name, if they differ from the field names.
+"""The names of the arrays in the cache file whose names differ from the field names. The keys are
+the field names.
 """
 
 

@@ -56,7 +56,8 @@ T = TypeVar("T")
 VERSION = 5
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""The numbers of progress steps for one snapshot and for one node of the table."""
+"""The number of progress steps that one snapshot counts, and the number that one table node counts.
+"""
 POLL_S = 0.2
 """The period of progress reports and stop checks while snapshots are solved, in seconds."""
 SNAPSHOT_BYTES = 600_000_000
@@ -79,7 +80,7 @@ class TableSpec:
 def local_processes(count: int) -> Iterator[Executor]:
     """Yield an executor with `count` processes on this computer.
 
-    If the context exits with an exception, the processes stop without finishing their jobs.
+    If the context exits with an exception, the processes stop and do not finish their jobs.
     """
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
@@ -105,10 +106,10 @@ def _init_worker(stop: Event) -> None:
 
 
 def _exit_on(stop: Event) -> None:
-    """Exit the worker process as soon as an event is set.
+    """Exit the worker process as soon as the event `stop` is set.
 
-    This is necessary because a job checks for a stop only after each push depth, which may take a
-    minute. The parent process stores finished results.
+    This is necessary because a job checks only after each push depth whether it must stop. One push
+    depth can take a minute. The parent process stores finished results.
     """
     stop.wait()
     os._exit(0)
@@ -257,11 +258,11 @@ def _compute_table(
 def _interpolate_by(
     executor: Executor, on_progress: Callable[[int, int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the snapshots at the nodes of all jobs with an executor, and return the results
-    in order.
+    """Interpolate the snapshots at the nodes of all jobs with an executor. Return the results in
+    the order of the jobs.
 
     on_progress: function that receives the number of finished nodes and the total number of nodes.
-        Nodes that are mirror images of others have no job.
+        Nodes that are mirror images of other nodes are in no job.
     """
     filled: dict[int, FilledNodes] = {}
     total = sum(len(job.samples) for job in jobs)
@@ -280,9 +281,9 @@ def _collect(
 ) -> None:
     """Wait for all futures, and cancel the pending futures after an exception.
 
-    waiting: indices by future. on_result: function that receives the index and the result of each
-    future. on_progress: function that is called periodically. Raises LostWorkersError if the
-    executor loses its workers, and the errors of the futures.
+    waiting: futures, each with an index. on_result: function that receives the index and the result
+    of each future. on_progress: function that is called periodically. Raises LostWorkersError if
+    the executor loses its workers. Also raises the errors of the futures.
     """
     try:
         while waiting:
@@ -315,8 +316,9 @@ def solve_all(
     """Load the snapshots of jobs from a store. Compute and store the missing snapshots.
 
     on_progress: function that receives the number of finished snapshots. It may raise an exception
-    to cancel the pending jobs. names: names of the stored snapshots; empty for "push-0000" and so
-    on. Raises LostWorkersError if the executor loses its workers, and the errors of the jobs.
+    to cancel the pending jobs. names: names of the stored snapshots. If `names` is empty, the names
+    are "push-0000", "push-0001" and so on. Raises LostWorkersError if the executor loses its
+    workers. Also raises the errors of the jobs.
     """
     names = names or [f"push-{number:04d}" for number in range(len(jobs))]
     solved: dict[int, snapshots.Snapshot] = {}

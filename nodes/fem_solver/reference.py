@@ -1,7 +1,7 @@
 """Compute reference solutions for the soft-body benchmark, and tables around a single point.
 
-Both consist of solutions of Newton's method for pushes at or near one surface point. Worker
-processes compute these solutions, and the cache stores them.
+Reference solutions and tables consist of solutions of Newton's method for pushes at or near one
+surface point. Worker processes compute these solutions, and the cache stores them.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ VERSION = 3
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSolution:
-    """A reference solution of pushes at one sample point, on one mesh.
+    """A reference solution on one mesh for pushes at one sample point.
 
-    name: description of the mesh. locator: search structure for points on the surface of the mesh.
+    name: description of the mesh. locator: search structure that finds points on the surface of the
+    mesh.
     """
 
     name: str
@@ -74,7 +75,7 @@ class ReferenceSolution:
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job for pushes on a mesh that is fine near the finger.
+    """Return the snapshot job for pushes on a mesh that is fine near the finger.
 
     ratio: skin spacing near the finger, in finger radii. If the shape does not support meshes that
     are fine only near the finger, all touchable skin has this spacing.
@@ -95,7 +96,9 @@ def make_focused_job(
 def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job for pushes on a mesh with the same spacing on all touchable skin."""
+    """Return the snapshot job for pushes on a mesh with the same node spacing on all touchable
+    skin.
+    """
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
     return snapshots.make_job_on_mesh(
         mesh,
@@ -154,8 +157,8 @@ def _digest(*jobs: SnapshotJob) -> str:
 class LocalTable:
     """A nonlinear table of a body that is filled only near one surface point.
 
-    Near this point, the values equal those of the full table. Only the few snapshots of the
-    attribute `jobs` are needed.
+    Near this point, its values equal the values of the full table. The table needs only a few
+    snapshots, whose jobs are in the attribute `jobs`.
     """
 
     def __init__(
@@ -189,7 +192,10 @@ class LocalTable:
         self.jobs += [] if fine_job is None else [fine_job]
 
     def body(self, solved: Sequence[Snapshot]) -> SceneBody:
-        """Return the body with the table that is built from the solved snapshots of `jobs`."""
+        """Return the body with a table that is built from snapshots.
+
+        solved: snapshots of the jobs in `jobs`, in the same order.
+        """
         response, radius = self._model.response, self._scene.finger.radius_m
         linear = unit_linear_body(
             response, self._body.shape, response.rest[self._model.bounds], radius

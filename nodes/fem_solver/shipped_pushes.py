@@ -1,9 +1,9 @@
 """Load the pushes (snapshots) of the coarse table that the package contains for some scenes.
 
-For these scenes, the coarse table is available without a long computation. The files are in the
-folder `pushes`, and are named by the key of the table. The command `python -m
-benchmarks.ship_pushes` writes them. The key changes with every input of the pushes, so an outdated
-file is not used.
+For these scenes, no long computation is necessary before the coarse table is available. The files
+are in the folder `pushes`, and are named by the key of the table. The command `python -m
+benchmarks.ship_pushes` writes them. The key changes if any input of the pushes changes, so an
+outdated file is not used.
 """
 
 from __future__ import annotations
@@ -26,15 +26,13 @@ LEVELS = 32767
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path of the file with the shipped snapshots of a table, even if there is no such
-    file.
-    """
+    """Return the path of the file with shipped snapshots of a table. The file need not exist."""
     return FOLDER / entry.path(FOLDER).name
 
 
 def load_shipped(path: Path) -> dict[str, Snapshot]:
-    """Return the shipped snapshots of a file by name. If the file does not exist, the result is
-    empty.
+    """Load the shipped snapshots from a file, and return them with their names as keys. If the file
+    does not exist, the result is empty.
     """
     content = load_arrays(path)
     if content is None:
@@ -55,7 +53,9 @@ def _decode(arrays: Mapping[str, NDArray[Any]]) -> Snapshot:
 
 
 def save_shipped(path: Path, snapshots: Mapping[str, Snapshot]) -> None:
-    """Write snapshots by name to a compressed file with rounded displacements."""
+    """Write snapshots, given with their names as keys, to a compressed file. The displacements are
+    rounded.
+    """
     arrays: dict[str, NDArray[Any]] = {}
     for name, one in snapshots.items():
         scale_m = np.abs(one.moved).max(axis=(1, 2), initial=1e-9) / LEVELS

@@ -24,8 +24,8 @@ displacement field decreases from 1 to 0."""
 NEIGHBOURS = 7
 CANDIDATES = 4
 RIDGE = 1e-2
-"""The relative ridge penalty on the slopes of the local fit. It is necessary because the fit may be
-underdetermined."""
+"""The relative ridge penalty on the slopes of the least-squares fit to nearby snapshots. It is
+necessary because there can be too few snapshots to determine the slopes."""
 FACE_COORDINATES = np.array(
     [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]
 )
@@ -49,10 +49,10 @@ class SurfaceLocator:
         self._sides, self._inverse = sides, gram @ sides
 
     def weights(self, points: Floats) -> tuple[Ints, Floats]:
-        """Find the skin points nearest to points (q, 3), m.
+        """Find the skin point that is nearest to each of the given points (q, 3), m.
 
-        Return the nodes (q, 6) of the nearest faces, and the shape functions (q, 6) at the found
-        points.
+        Return the indices (q, 6) of the nodes of the nearest faces, and the shape functions (q, 6)
+        of these nodes at the found points.
         """
         _, near = self._tree.query(points, k=CANDIDATES)
         offset = points[:, None] - self._origin[near]
@@ -111,9 +111,10 @@ class SnapshotInterpolator:
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats, float]:
         """Interpolate the snapshots at a new sample point.
 
-        rest (s, 3): undeformed skin nodes, m. Calls with the same array are faster. Return the
-        displacement (k, s, 3), m, and the force (k, 3), N, for 1 Pa at k depths. The last result is
-        the weighted mean of the numbers of converged depths of the used snapshots.
+        rest (s, 3): undeformed positions of the s skin nodes, m. Calls with the same array are
+        faster. Return the displacement (k, s, 3), m, and the force (k, 3), N, at k depths for a
+        Young's modulus of 1 Pa. The last result is the weighted mean number of depths at which the
+        snapshots converged.
         """
         if rest is not self._rest:
             self._rest, self._fixed = rest, {}
@@ -216,7 +217,8 @@ class SnapshotSet:
 def place_snapshots(
     samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
 ) -> list[PlacedSnapshot]:
-    """Return the snapshots and their mirror images, without duplicates on planes of symmetry.
+    """Return the snapshots and their mirror images. A snapshot on a plane of symmetry is not
+    duplicated.
 
     mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
     """

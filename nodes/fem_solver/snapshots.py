@@ -26,7 +26,7 @@ DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0
 SPACING_RATIO = 0.35
 """The distance between skin nodes near the push, in finger radii."""
 NEAR_RATIO = 1.5
-"""The distance from the push within which the mesh is fine, in finger radii."""
+"""The distance from the pushed point, in finger radii, within which the mesh is fine."""
 STATIONS = (0.0, 0.4, 0.7, 0.9)
 """The positions of the sample points along a cylinder, as fractions of its half length."""
 ANGLE_STEP_RAD, RIM_RAD = 0.42, 0.25
@@ -37,12 +37,12 @@ APART_RATIO, RIM_RATIO = 2.2, 0.9
 in finger radii. They apply to shapes other than cylinders."""
 TOLERANCE, MAX_STEP_RATIO, MIN_STEP_FRACTION = 1e-3, 1.0, 0.25
 """The settings of Newton's method for snapshots: the tolerance, and the maximum and minimum load
-step. They are less strict than the settings for a reference solution. This changes the force by at
-most 0.04 % and halves the computation time.
+step. The settings for a reference solution are stricter. The difference in force is at most 0.04 %,
+but the computation time is halved.
 """
 MIN_VOLUME_RATIO = 0.2
-"""The volume ratio of the most compressed element below which a push ends. Below this ratio, the
-solution at the next depth would not converge."""
+"""The minimum ratio of deformed to undeformed volume of any element. A push ends at this ratio.
+Below this ratio, the solution at the next depth would not converge."""
 QUICK_DEPTHS_M = (0.0025, 0.005, 0.010)
 QUICK_COUNT = 9
 """The number of sample points of the coarse table, which is computed first. `QUICK_DEPTHS_M`
@@ -63,7 +63,7 @@ class SnapshotCancelledError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SamplePoint:
-    """A surface point (3,), m, and its outward normal (3,), mesh frame."""
+    """A surface point (3,), m, and its outward normal (3,), in the mesh frame."""
 
     point: Floats
     normal: Floats
@@ -73,10 +73,10 @@ class SamplePoint:
 class SnapshotJob:
     """The inputs of a snapshot: pushes at one sample point to several depths.
 
-    nodes (n, 3), m, elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
-    six-node triangles that the finger can touch. depths_m: push depths. mirror_axes: axes of planes
-    of symmetry through the sample point if the mesh contains only one side of these planes, 0 for x
-    = 0 and 1 for y = 0.
+    nodes (n, 3): positions of the n nodes, m. elements (e, 10): node indices. fixed (n,): whether
+    each node is fixed. faces (f, 6): six-node triangles that the finger can touch. depths_m: push
+    depths. mirror_axes: axes of the planes of symmetry at which the mesh ends, 0 for x = 0 and 1
+    for y = 0. These planes contain the sample point.
     """
 
     nodes: Floats
@@ -94,10 +94,11 @@ class SnapshotJob:
 class Snapshot:
     """The solution of a snapshot job.
 
-    rest (s, 3): undeformed skin nodes, m. faces (f, 6): six-node triangles of the skin. depths_m
-    (k,): push depths. moved (k, s, 3): displacement (m) of the s skin nodes at these k depths.
-    force_n (k, 3): force on the finger for a Young's modulus of 1 Pa. reached: number of converged
-    depths. Entries at larger depths repeat the last converged solution.
+    rest (s, 3): undeformed positions of the s skin nodes, m. faces (f, 6): six-node triangles of
+    the skin. depths_m (k,): push depths. moved (k, s, 3): displacement (m) of the s skin nodes at
+    these k depths. force_n (k, 3): force on the finger for a Young's modulus of 1 Pa. reached:
+    number of converged depths. At depths for which no solution converged, the entries repeat the
+    last converged solution.
     """
 
     rest: Floats
@@ -160,8 +161,9 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
 
 
 def _unfold_snapshot(snapshot: Snapshot, sample: SamplePoint, axis: int) -> Snapshot:
-    """Return the snapshot of a whole body from the snapshot of its half on one side of a plane of
-    symmetry.
+    """Return the snapshot of a whole body, given the snapshot of one half of this body.
+
+    axis: axis that is perpendicular to the plane of symmetry between the halves.
     """
     signs = np.ones(3)
     signs[axis] = -1.0
@@ -205,7 +207,8 @@ def choose_sample_points(
 ) -> list[SamplePoint]:
     """Choose sample points that, with their mirror images, cover the touchable skin.
 
-    mirrors: vectors (3,) of signs, one for each mirror symmetry. radius_m: radius of the finger.
+    mirrors: vectors (3,) of signs, one for each mirror symmetry of the body. radius_m: radius of
+    the finger.
     """
     if isinstance(spec.geometry, Cylinder):
         return _choose_cylinder_points(spec.geometry, spec.touch_angle_rad, mirrors)
@@ -284,8 +287,8 @@ def make_snapshot_job(
     """Return the job for the pushes at a sample point.
 
     For a cylinder on a strip support, the job has a new mesh that is fine near the push. Otherwise,
-    it has the given mesh. spacing_m: skin spacing of the new mesh; None for the default of a table.
-    depths_m: push depths; None for `DEPTHS_M`.
+    it has the given mesh. spacing_m: skin spacing of the new mesh; if it is None, the default for
+    tables is used. depths_m: push depths; if it is None, `DEPTHS_M` is used.
     """
     spacing_m = spacing_m or _spacing_m(spec, finger_radius_m)
     focused = _make_focused_mesh(spec, sample, spacing_m, NEAR_RATIO * finger_radius_m, None)
@@ -332,8 +335,9 @@ def _make_focused_mesh(
     """Return a mesh that is fine near a sample point, or None if the shape does not support such
     meshes.
 
-    spacing_m: skin spacing near the point. near_m: distance within which the mesh has this spacing.
-    growth: increase of the element size per distance (m/m); None for the default.
+    spacing_m: skin spacing near the point. near_m: distance from the point within which the mesh
+    has this spacing. growth: increase of the element size per distance (m/m); if it is None, the
+    default is used.
     """
     geometry, support = spec.geometry, spec.support
     if not (isinstance(geometry, Cylinder) and isinstance(support, StripSupport)):
@@ -357,7 +361,7 @@ def _make_focused_mesh(
 def _mirror_axes(sample: SamplePoint) -> tuple[int, ...]:
     """Return the axes of the planes of symmetry of a cylinder that contain the sample point.
 
-    The possible planes are x = 0 and y = 0, because the support is centred on -z.
+    Only the planes x = 0 and y = 0 are considered.
     """
     return tuple(
         axis for axis in (0, 1) if max(abs(sample.point[axis]), abs(sample.normal[axis])) < SAME_M
@@ -375,7 +379,7 @@ def make_job_on_mesh(
 ) -> SnapshotJob:
     """Return the job for pushes at a sample point to several depths with a given mesh.
 
-    mirror_axes: axes of planes of symmetry if the mesh contains only one side of these planes.
+    mirror_axes: axes of the planes of symmetry at which the mesh ends, 0 for x = 0 and 1 for y = 0.
     """
     return SnapshotJob(
         nodes=mesh.nodes,
@@ -411,5 +415,5 @@ def reflect_snapshot(
 
 
 def decode_snapshot(content: dict[str, NDArray[Any]]) -> Snapshot:
-    """Convert the arrays of a cached snapshot, by field name, to a snapshot."""
+    """Make a snapshot from the arrays of a cache file, whose keys are the field names."""
     return Snapshot(reached=int(content.pop("reached")), **content)

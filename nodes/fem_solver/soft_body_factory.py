@@ -20,11 +20,12 @@ from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 from flexsheet.nodes.fem_solver.table import Table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
-"""A soft-body method, or `auto`. `auto` selects the nonlinear table if it is cached, and the linear
-method otherwise."""
+"""A soft-body method, or `auto`. The value `auto` selects the nonlinear table if the table is
+cached, and the linear method otherwise."""
 
 SKIN_SPACING_M = 0.003
-"""The distance between skin nodes if neither a parameter nor the scene specifies it, in metres."""
+"""The default distance between skin nodes, in metres. It is used if neither a parameter nor the
+scene specifies a distance."""
 
 
 def choose_method(
@@ -51,11 +52,11 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """Build soft bodies, and store the last precomputed model in memory.
+    """A builder of soft bodies that stores the last precomputed model in memory.
 
     workers: number of processes that compute a table; 0 means one per core. scheduler: address of a
     dask scheduler whose workers compute the table instead. If the cache in `cache_dir` is empty,
-    each call of a method takes seconds to minutes.
+    calls of the methods take seconds to minutes.
     """
 
     skin_spacing_m: float
@@ -107,8 +108,8 @@ class SoftBodyFactory:
     def _load_model(
         self, spec: precompute.SoftBodySpec, progress: precompute.Progress
     ) -> precompute.SoftBodyModel:
-        """Return the model of a specification. The last model is reused if its inputs are equal.
-        Otherwise, the model is loaded or computed.
+        """Return the precomputed model for the inputs `spec`. If the last model has the same
+        inputs, it is reused. Otherwise, the model is loaded or computed.
         """
         # Read `_model` only once: another thread whose result is no longer needed may replace it.
         last, key = self._model, spec.key()
@@ -144,8 +145,8 @@ class SoftBodyFactory:
         """Compute and cache the nonlinear table, and return the body that uses it.
 
         linear: body with the linear method. on_quick: function that receives a body with a coarse
-        table of few snapshots; if it is None, no coarse table is computed. Raises WorkersError if
-        the workers cannot be used or are lost, and MemoryError if the free memory is insufficient.
+        table; if it is None, no coarse table is computed. Raises WorkersError if the workers cannot
+        be used or are lost, and MemoryError if the free memory is insufficient.
         """
         model = self._load_model(linear.spec, progress)
 

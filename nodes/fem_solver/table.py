@@ -1,14 +1,14 @@
 """Compute the response to pushes from a precomputed nonlinear table.
 
-For pushes at every touchable node to several depths, the table contains the force and the
-displacement of the skin (the surface of the body). Shape functions of the mesh interpolate between
-nodes. Cubic polynomials with a continuous slope interpolate between depths. Therefore the response
-is a continuous function of the finger's position. One response reads 24 rows of the table, for six
-nodes at four depths.
+The table contains the force and the displacement of the skin (the surface of the body) for pushes
+at every touchable node to several depths. Shape functions of the mesh interpolate between nodes.
+Cubic polynomials with a continuous slope interpolate between depths. Therefore the response is a
+continuous function of the finger's position. One response reads 24 rows of the table, for six nodes
+at four depths.
 
 The table is filled with solutions of Newton's method, called snapshots, at several tens of sample
-points. The module `snapshot_interpolator` interpolates them to the other nodes. At small depths the
-linear method is used instead.
+points. The module `snapshot_interpolator` interpolates them to the other nodes. At small depths,
+the table contains the response of the linear method.
 """
 
 from __future__ import annotations
@@ -39,13 +39,14 @@ from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SAME_RATIO, SampleP
 from flexsheet.nodes.models.interpolation import smoothstep
 
 LINEAR_DEPTHS_M = (0.0007,)
-"""The depths of the table that are not contained in the snapshots."""
+"""The depths (m) that the table has in addition to the depths of the snapshots."""
 BLEND_M = (0.0007, 0.0015)
-"""The range of depths in which the table changes from the linear response to the snapshots."""
+"""The range of depths (m) in which the table gradually changes from the linear response to the
+snapshots."""
 MIN_COSINE = -0.25
 """The minimum cosine of the angle between the deformed and the undeformed normal of a triangle."""
 END_SPAN_M = 0.00125
-"""The distance (m) of the deepest solution below the end of the valid depth range. The responses to
+"""The distance (m) from the end of the valid depth range to the deepest solution. The responses to
 deeper pushes approach this solution."""
 FADE_RATIO = 2.0
 """The distance beyond the edge of the touchable skin, in finger radii, over which the displacement
@@ -59,7 +60,7 @@ FILLED_NODES = 48
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The responses to pushes at m contact nodes and to L depths, for a Young's modulus of 1 Pa.
+    """The responses to pushes at m contact nodes to L depths, for a Young's modulus of 1 Pa.
 
     depths_m (L,): push depths, of which the first is 0. fields (m, L - 1, 3s), float32:
     displacement (m) of the s skin nodes at all depths except 0. force_n (m, L, 3): force on the
@@ -85,8 +86,8 @@ def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
 class FillJob:
     """A job for a worker process that interpolates snapshots at some contact nodes.
 
-    samples: contact nodes. rest (s, 3): undeformed skin nodes, m. triangles (t, 3): skin triangles.
-    source: snapshots.
+    samples: contact nodes. rest (s, 3): undeformed positions of the s skin nodes, m. triangles (t,
+    3): skin triangles. source: snapshots that are interpolated.
     """
 
     samples: Sequence[SamplePoint]
@@ -99,7 +100,7 @@ class FillJob:
 class FilledNodes:
     """The interpolated snapshots at n nodes and k depths.
 
-    moved (n, k, 3 s): displacements of s skin nodes, m. force_n (n, k, 3): forces. reached (n,):
+    moved (n, k, 3 s): displacements of s skin nodes, m. force_n (n, k, 3): forces, N. reached (n,):
     mean number of depths at which the used snapshots converged. valid (n,): number of depths at
     which the displacement is valid.
     """
@@ -194,10 +195,11 @@ def find_mirror_images(
 ) -> dict[int, tuple[int, Floats, Ints]]:
     """Find the contact nodes whose pushes are mirror images of pushes at earlier contact nodes.
 
-    points (n, 3): contact nodes, m. rest (s, 3): undeformed skin nodes, m. mirrors: vectors (3,) of
-    signs, one for each mirror symmetry of the body. Symmetries that do not map all skin nodes to
-    skin nodes are ignored. Return, by contact node, the index of the earlier node, the signs, and
-    the indices (s,) of the mirror images of the skin nodes.
+    points (n, 3): positions of the contact nodes, m. rest (s, 3): undeformed positions of the skin
+    nodes, m. mirrors: vectors (3,) of signs, one for each mirror symmetry of the body. A symmetry
+    is ignored if it maps a skin node to a point that is not a skin node. The keys of the result are
+    contact nodes. The values are the earlier node, the signs, and the indices (s,) of the mirror
+    images of the skin nodes.
     """
     from scipy.spatial import cKDTree
 
@@ -225,13 +227,14 @@ def compute_force_factors(
     interpolator: SnapshotInterpolator,
     depths: Floats,
 ) -> Floats:
-    """Return the factors (L,) that correct the forces of a table at its depths (L,), m.
+    """Return the factors (L,) that correct the forces of a table at the L depths (L,), m.
 
     The meshes of the table are too coarse for small contacts. Therefore the forces in the table are
-    too large. Each factor is an estimate of the true force divided by the table's force at the same
-    point. The estimate is a Richardson extrapolation of order 2 from the meshes of the table and of
-    the fine push. At depths where the table contains the linear response, the estimate is the force
-    of the fine push. Beyond the depths of the fine push, the factor is constant.
+    too large. Each factor is an estimate of the true force divided by the force in the table at the
+    same point. fine: sample point and snapshot of a push on a fine mesh. The estimate is a
+    Richardson extrapolation of order 2 from the table's mesh and the fine mesh. At depths where the
+    table contains the linear response, the estimate is the force on the fine mesh. Beyond the
+    maximum depth of the push on the fine mesh, the factor is constant.
     """
     sample, push = fine
     solved_m = push.depths_m[: push.reached]
@@ -257,8 +260,9 @@ def _blend_levels(
 ) -> tuple[Singles, Floats]:
     """Blend interpolated snapshots with the linear response at small depths.
 
-    solved (k, 3 s), pushed (k, 3): interpolated displacement (m) and force (N) at the last k of the
-    L depths. Return the displacement (L, 3 s) and the force (L, 3) at all depths.
+    solved (k, 3s): interpolated displacement (m) of the s skin nodes at the last k of the L depths.
+    pushed (k, 3): interpolated force (N) at these k depths. Return the displacement (L, 3s) and the
+    force (L, 3) at all depths.
     """
     moved = np.zeros((len(depths), solved.shape[1]), dtype=np.float32)
     force = np.zeros((len(depths), 3))
@@ -283,7 +287,7 @@ class CubicInterpolator:
     """
 
     def __init__(self, depths_m: Floats) -> None:
-        """Compute the cubic polynomials for depths (L,), m. At least four depths are required."""
+        """Compute the cubic polynomials for L depths (L,), m. At least four depths are required."""
         count = len(depths_m)
         self._depths = depths_m.tolist()
         values = np.eye(count)
@@ -311,9 +315,10 @@ class CubicInterpolator:
 def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32]) -> int:
     """Count the successive depths at which the interpolated displacement is valid.
 
-    rest (s, 3): undeformed skin nodes, m. moved (L, s, 3): displacement at each depth, m. triangles
-    (t, 3): skin triangles. A displacement is invalid if a triangle is rotated by more than the
-    angle whose cosine is `MIN_COSINE`. This can happen at an edge of the skin.
+    rest (s, 3): undeformed positions of the s skin nodes, m. moved (L, s, 3): displacement at each
+    of the L depths, m. triangles (t, 3): skin triangles. A displacement is invalid if a triangle is
+    rotated by more than the angle whose cosine is `MIN_COSINE`. This can happen at an edge of the
+    skin.
     """
 
     def normals(points: Floats) -> Floats:
@@ -366,7 +371,7 @@ class TableSoftBody:
     ) -> None:
         """Precompute the force curves of all contact nodes.
 
-        bounds (b, 3): positions (m) of skin nodes that must not be touched. name: name of the
+        bounds (b, 3): positions (m) of the b skin nodes that must not be touched. name: name of the
         method in messages. push_depth_m: depth at which the force curve ends. linear_depth_m: depth
         at which the stiffness is evaluated.
         """
@@ -438,8 +443,9 @@ class TableSoftBody:
     def project_to_surface(self, surface: Floats) -> tuple[Ints, Floats, float]:
         """Find the point of the touchable skin that is nearest to a surface point (3,).
 
-        Return the nodes (6,) of the nearest face and the shape functions (6,) at the found point.
-        The third result is the distance (m) of the surface point from the touchable skin.
+        Return the indices (6,) of the nodes of the nearest face, and their shape functions (6,) at
+        the found point. The third result is the distance (m) of the surface point from the
+        touchable skin.
         """
         # The squared distances omit the square of `surface`, which is the same for all faces.
         squared = self._centre_squares - self._centres @ (2.0 * surface)

@@ -13,8 +13,8 @@ from flexsheet.nodes.arrays import Floats
 
 
 def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Floats:
-    """Return the matrix (3, 3) of a pinhole camera with the given focal lengths and principal
-    point, px.
+    """Return the matrix (3, 3) of a pinhole camera with the given focal lengths and principal point
+    (px).
     """
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
@@ -47,8 +47,8 @@ def undistort(distorted: Floats, distortion: Floats) -> Floats:
     distortion: coefficients k1, k2, p1, p2, k3, as for `distort`.
 
     The iteration stops when no coordinate changes by more than 1e-13, or after `MAX_ITERATIONS`.
-    The iteration converges where the distortion changes slowly. This is the case inside the image
-    of usual lenses.
+    The iteration converges at points near which the distortion changes slowly. For usual lenses,
+    these are all points inside the image.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()
@@ -67,7 +67,8 @@ def undistort(distorted: Floats, distortion: Floats) -> Floats:
 
 
 def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Return the pixels (..., 2) of points (..., 3) in the camera frame, m, with z > 0.
+    """Return the pixels (..., 2) onto which points (..., 3), m, in the camera frame are projected.
+    The points must have z > 0.
 
     matrix: camera matrix (3, 3).
     distortion: coefficients, as for `distort`.

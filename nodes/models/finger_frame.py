@@ -1,4 +1,4 @@
-"""Define the frame of a finger: its origin is at the finger pad, x points to the hand, and z points
+"""Define the frame of a finger. The origin is at the finger pad, x points to the hand, and z points
 out of the nail.
 """
 

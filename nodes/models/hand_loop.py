@@ -1,4 +1,4 @@
-"""Predict whether a hand that touches the sheet is stable in the sampled closed loop.
+"""Predict whether the sampled control loop of sheet and hand is stable.
 
 A finger pushes into the sheet. The planner moves the sheet along its normal by `slope` times the
 measured depth. If slope > 0, the sheet moves away from the finger (a retreat, for soft objects). If
@@ -12,9 +12,9 @@ and the sheet's offset s:
 
 Here y_j is the filtered depth of measurement j, and y'_j is the filter's estimate of the rate of
 the depth. The alpha-beta filter estimates the depth and its rate. The filtered depth does not lag
-behind a depth with a constant rate. A linear map, computed exactly, describes the change of the
-state over one period. The control loop is stable if all eigenvalues of this map are inside the unit
-circle.
+behind a depth with a constant rate. A linear map, which is computed exactly, describes how the
+state changes over one period. The control loop is stable if all eigenvalues of this map are inside
+the unit circle.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ import scipy
 from flexsheet.nodes.arrays import Floats
 
 MIN_DECAY_PER_S = 0.5
-"""The minimum decay rate (1/s) of the slowest mode at which the control loop counts as stable."""
+"""The minimum decay rate (1/s) of the slowest mode. If the rate is lower, the control loop counts
+as unstable."""
 
 GAIN_MARGIN = 1.5
 DELAY_MARGIN_S = 0.02
-"""The additional delay (s) that the control loop must tolerate. `GAIN_MARGIN` is the required
-margin of the gain, as a factor."""
+"""The additional delay (s) that the control loop must tolerate. `GAIN_MARGIN` is the factor of
+additional gain that the loop must tolerate."""
 
 MAX_SLOPE = 20.0
-"""The upper limit of the slope in the search for the critical slope. Slopes in use are much
-smaller."""
+"""The upper limit of the slope in the search for the critical slope. The planner uses much smaller
+slopes."""
 
 SLOPES = 32
 """The number of slopes at which the search evaluates the decay rate."""
@@ -45,12 +46,12 @@ SLOPES = 32
 DELAYS_S = (0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.17)
 BANDWIDTHS_RAD_PER_S = (4.5, 5.5, 6.5, 8.0, 10.0, 12.5, 16.0, 20.0)
 SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
-"""The sheet stiffnesses (N/m) of the grid of `OffsetBoundsTable`. The other two axes of the grid
-are `DELAYS_S` and `BANDWIDTHS_RAD_PER_S`."""
+"""The sheet stiffnesses (N/m) for which `OffsetBoundsTable` contains bounds. The other two axes of
+the table are `DELAYS_S` and `BANDWIDTHS_RAD_PER_S`."""
 
 FILTER_DAMPING_RATIO = 0.5
-"""The damping ratio of the filter of the finger's depth. With a larger ratio, the control loop
-would already become unstable at smaller sheet offsets."""
+"""The damping ratio of the filter that smooths the finger's depth. If the ratio were larger, the
+control loop would become unstable at smaller sheet offsets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +75,13 @@ HANDS = {
 }
 """Models of hands that cover the range of the measurements in the literature.
 
-Finger: Hajian and Howe 1997. Wrist: from its resonance of 6 to 12 Hz, Lakie 2015. Arm:
-Mussa-Ivaldi, Hogan and Bizzi 1985. The damping ratios of wrist and arm are 0.15 to 0.4.
+Sources: Hajian and Howe 1997 (finger), Lakie 2015 (wrist, from its resonance at 6 to 12 Hz), and
+Mussa-Ivaldi, Hogan and Bizzi 1985 (arm). The damping ratios of wrist and arm are 0.15 to 0.4.
 """
 
 LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in name)
-"""The hands with low damping, which determine the bounds because they become unstable first."""
+"""The hands with low damping. They determine the bounds, because they become unstable at smaller
+slopes than other hands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,8 @@ class SampledLoop:
 
     period_s: time between two measurements.
     delay_s: time from a measurement until the sheet reaches the position computed from it.
-    bandwidth_rad_per_s: natural frequency of the depth's filter; infinite if there is no filter.
+    bandwidth_rad_per_s: natural frequency of the filter of the depth; infinite if there is no
+        filter.
     lead_s: time by which the filtered depth is extrapolated with its estimated rate.
     """
 
@@ -99,10 +102,13 @@ class SampledLoop:
 
 
 def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[float, float]:
-    """Return the gains (alpha, beta) of the depth's filter for a step of `step_s`.
+    """Return the gains alpha and beta of the filter that smooths the finger's depth.
 
     The filter has the poles of a continuous filter with the damping ratio `FILTER_DAMPING_RATIO`.
-    If the bandwidth is infinite, the filter returns the measured depth and its last change.
+    If the bandwidth is infinite, the filter returns the measured depth and the rate of its last
+    change.
+
+    step_s: time between two measurements.
     """
     if math.isinf(bandwidth_rad_per_s):
         return 1.0, 1.0
@@ -115,11 +121,12 @@ def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[flo
 def make_loop_matrices(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the matrices (k, n, n) that map the n states over one period, for slopes (k,).
+    """Return the matrices (k, n, n) that map the n states over one period, for each of k slopes
+    (k,).
 
-    The states are the depth and its rate, the filter's estimates of both, and sheet offsets from
-    newest to oldest. The offsets are all that have not yet taken effect, and the last two that have
-    taken effect.
+    The states are the depth and its rate, the filter's estimates of both, and recent sheet offsets
+    from newest to oldest. The offsets include the last two that the sheet has reached, and all that
+    it has not reached yet.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1
@@ -164,7 +171,7 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rate (k,) of the slowest mode (1/s) for slopes (k,).
+    """Return the decay rate (k,), 1/s, of the slowest mode for each of k slopes (k,).
 
     A negative rate means that the mode grows.
     """
@@ -183,13 +190,14 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the smallest slope magnitude at which the loop is unstable, at most `max_slope`.
+    """Return the smallest magnitude of the slope at which the control loop is unstable. The result
+    is at most `max_slope`.
 
     towards_finger: whether the slopes are negative. If a slope is negative, the sheet moves towards
         the finger.
 
-    The decay rate is interpolated between slopes on a grid. Larger slopes are not evaluated, even
-    if the loop is stable there.
+    The decay rate is interpolated between slopes on a grid. Slopes above the result are not
+    evaluated, even if the loop is stable at some of them.
     """
     magnitudes = np.concatenate([[0.0], np.geomspace(0.01 * max_slope, max_slope, SLOPES)])
     decays = compute_decays_per_s(
@@ -212,7 +220,7 @@ def compute_critical_slope(
 class OffsetBounds:
     """The maximum slopes (sheet offset divided by finger depth) at which every hand is stable.
 
-    bandwidths_rad_per_s (f,): bandwidths of the depth's filter, ascending.
+    bandwidths_rad_per_s (f,): bandwidths of the filter of the depth, ascending.
     sheet_stiffnesses_n_per_m (k,): stiffnesses of the sheet under the finger.
     max_advances, max_retreats (f, k): maximum slopes towards the finger and away from it.
     """
@@ -223,7 +231,8 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) at which the sheet may move towards the finger.
+        """Return the maximum slopes (n,) at which the control loop is stable if the sheet moves
+        towards the finger.
 
         A slope is the sheet offset divided by the finger depth.
 
@@ -232,7 +241,8 @@ class OffsetBounds:
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) at which the sheet may move away from the finger.
+        """Return the maximum slopes (n,) at which the control loop is stable if the sheet moves
+        away from the finger.
 
         A slope is the sheet offset divided by the finger depth.
 
@@ -253,7 +263,8 @@ class OffsetBounds:
 class OffsetBoundsTable:
     """A table of `OffsetBounds` over the delays (d,) of the control loop, for one camera period.
 
-    The arrays of slopes have the shape (d, f, k), as in `OffsetBounds`.
+    The arrays of slopes have the shape (d, f, k) for d delays, f bandwidths and k sheet
+    stiffnesses.
     """
 
     delays_s: Floats
@@ -263,7 +274,7 @@ class OffsetBoundsTable:
     max_retreats: Floats
 
     def at_delay(self, delay_s: float) -> OffsetBounds:
-        """Return the bounds at the smallest delay of the table that is not below `delay_s`.
+        """Return the bounds at the smallest delay in the table that is at least `delay_s`.
 
         The bounds are 0 if all delays of the table are smaller.
         """
@@ -276,7 +287,8 @@ class OffsetBoundsTable:
 
 
 def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
-    """Compute the maximum slopes at which all hands are stable, even if gain and delay are larger.
+    """Compute the maximum slopes at which the control loop is stable for all hands. It must be
+    stable even if its gain and delay are larger by the margins.
 
     advance_limit: upper limit of the slopes towards the finger.
 
@@ -320,6 +332,9 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
 
 
 def _descend(slopes: Floats) -> Floats:
-    """Make slopes (d, f, k) non-increasing over the delay (d) and the stiffness (k)."""
+    """Reduce slopes so that they never increase with the delay or the stiffness.
+
+    slopes (d, f, k): slopes for d delays, f bandwidths and k stiffnesses.
+    """
     result = np.minimum.accumulate(np.minimum.accumulate(slopes, axis=0), axis=2)
     return np.asarray(result)

@@ -28,11 +28,14 @@ def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats
     path (n, 3): positions, m, at intervals of `step_s`.
 
     The interpolation is cubic with central differences as slopes (Catmull and Rom 1974). The
-    extrapolation beyond both ends is linear. Raises ValueError for a path of fewer than two points.
+    extrapolation beyond both ends is linear. Raises ValueError if the path has fewer than two
+    points.
     """
     count = len(path)
     if count < 2:
-        raise ValueError(f"the predicted path has {count} points; at least two are required")
+        raise ValueError(
+            f"the predicted path has {count} points; at least two are required; send a longer path"
+        )
     steps = time_s / step_s
     i = min(max(int(np.floor(steps)), 0), count - 2)
     t = steps - i

@@ -11,8 +11,8 @@ MAX_PERIOD_S = 0.1
 """The maximum measured period, s. Longer intervals between messages count as interruptions."""
 
 TOLERANCE_RATIO = 0.2
-"""The relative deviation of the measured period from the scene's camera period, up to which the
-scene's period is used."""
+"""The maximum relative difference between the measured period and the scene's camera period. If the
+difference is smaller, the scene's period is used."""
 
 
 class MeasuredPeriod:

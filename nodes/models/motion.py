@@ -1,8 +1,7 @@
 """Compute the motion of a point that follows a moving target with bounded speed and acceleration.
 
 The velocity of the target is fed forward. Therefore a point that has reached the target does not
-lag behind it. Before that, the point approaches without overshoot if the target's velocity is
-constant.
+lag behind it. If the target's velocity is constant, the point approaches it without overshoot.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ def closing_speed(distance: Floats | float, deceleration: Floats | float, step_s
     """Return the maximum speeds (n,) at which a point can stop within distances (n,) >= 0 (m).
 
     In each step, the point moves by speed * step_s, and then its speed decreases by deceleration *
-    step_s. The speed w fulfils w^2/(2 a) + w dt/2 = distance, with deceleration a and step dt. The
-    speed is at most distance / dt.
+    step_s. The speed w is the solution of w^2/(2 a) + w dt/2 = distance, where a is the
+    deceleration and dt is the step. The speed is at most distance / dt.
     """
     half = 0.5 * deceleration * step_s
     speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half
@@ -48,7 +47,8 @@ def follow(
     max_acceleration: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return the displacement (n,) in one step towards a moving target, and the new velocity (n,).
+    """Return the displacement (n,) of a point in one step towards a moving target, and its new
+    velocity (n,).
 
     error (n,): target at the end of the step minus the current point.
     velocity, target_velocity (n,): current velocities of the point and of the target.
@@ -136,19 +136,20 @@ class SheetBounds:
 
 @dataclass(frozen=True, slots=True)
 class EdgeBound:
-    """The limit of the speed of all points of the sheet's clamped edges.
+    """The maximum speed of any point on the sheet's clamped edges.
 
     reach_m: half the length of an edge.
 
     Translation and rotation are scaled by the same factor. If each arm limited the speed of its
-    edge separately, the distance of the edges would change.
+    edge separately, the distance between the edges would change.
     """
 
     speed_m_per_s: float
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0 to 1) by which both speeds of the sheet must be multiplied.
+        """Return the factor (0 to 1) by which the linear and the angular speed of the sheet must be
+        multiplied.
 
         At the reduced speeds, no point of the edges exceeds the limit.
         """
@@ -259,10 +260,10 @@ def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
 def follow_trajectory(
     motion: SheetMotion, time_s: float, *, keep_s: float, brake_s: float
 ) -> SheetMotion:
-    """Return the motion after the time `time_s`, if no further target arrives.
+    """Return the motion at the time `time_s` after a given motion, if no further target arrives.
 
-    The twist is constant for `keep_s`, and then decreases uniformly to zero within `brake_s`. The
-    stretch ratio is constant.
+    The twist (velocity) is constant for the time `keep_s`, and then decreases uniformly to zero
+    within the time `brake_s`. The stretch ratio is constant.
     """
     braked_s = min(max(time_s - keep_s, 0.0), brake_s)
     travelled_s = min(time_s, keep_s) + braked_s - 0.5 * braked_s * braked_s / brake_s
@@ -280,7 +281,9 @@ def _decelerate(velocity: Floats, change: float) -> Floats:
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """Return a pose (4, 4) whose rotation is made orthonormal again (Gram-Schmidt on x and y)."""
+    """Make the rotation matrix of a pose (4, 4) orthonormal again, and return the pose. The method
+    is Gram-Schmidt on the x and y axes.
+    """
     (ax, bx, _, px), (ay, by, _, py), (az, bz, _, pz), last = pose.tolist()
     length = sqrt(ax * ax + ay * ay + az * az)
     ax, ay, az = ax / length, ay / length, az / length

@@ -1,8 +1,8 @@
-"""Detect from noisy residuals that the scene describes the hardware incorrectly.
+"""Detect errors in the scene's description of the hardware from noisy residuals.
 
-A residual is a measured value minus its expected value. The mean of the residuals has exponentially
-decaying weights. An error is suspected when the mean has exceeded a threshold for some time without
-interruption.
+A residual is a measured value minus its expected value. The weights of the residuals in their mean
+decay exponentially with time. An error is suspected when the mean has exceeded a threshold for some
+time without interruption.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 MAX_GAP_S = 1.0
-"""The maximum weight of a residual in the mean, s. The weight is the time since the previous
+"""The maximum weight (s) of a residual in the mean. The weight is the time since the previous
 residual."""
 
 CLEAR_RATIO = 0.8
@@ -40,7 +40,7 @@ class ResidualMonitor:
         components: length of the residual vector.
         threshold: maximum magnitude of the mean, in the unit of the residuals.
         memory_s: time constant of the exponential weights of the mean.
-        confirm_s: time for which the mean must exceed the threshold until an error is suspected.
+        confirm_s: time for which the mean must exceed the threshold before an error is suspected.
         """
         self.mean, self.suspected, self.threshold = np.zeros(components), False, threshold
         self._memory_s, self._confirm_s = memory_s, confirm_s
@@ -49,7 +49,7 @@ class ResidualMonitor:
 
     @property
     def has_data(self) -> bool:
-        """Return whether the residuals cover enough time to compare their mean with the
+        """Return whether the residuals cover enough time for a comparison of their mean with the
         threshold.
         """
         return self._weight_s >= 0.5 * self._memory_s
@@ -60,8 +60,8 @@ class ResidualMonitor:
         return float(np.linalg.norm(self.mean))
 
     def add(self, residual: Floats, at_ns: int) -> None:
-        """Add a residual (components,) at the time `at_ns`. Residuals that are not finite are
-        ignored.
+        """Add a residual vector that was measured at the time `at_ns`. A residual that is not
+        finite is ignored.
         """
         if not np.isfinite(residual).all():
             return

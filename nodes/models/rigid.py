@@ -1,4 +1,4 @@
-"""Compute with rigid transforms, which consist of a rotation and a translation.
+"""Create, convert and apply rigid transforms, which consist of a rotation and a translation.
 
 A transform `a_from_b` is a homogeneous matrix (4, 4) that maps coordinates in frame b to frame a. A
 twist is a vector (6,) in the world frame: linear velocity (m/s), then angular velocity (rad/s).
@@ -50,7 +50,7 @@ def rpy_from_rotation(rotation: Floats) -> Floats:
 def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
     """Return the matrix (3, 3) of a rotation vector (3,) by Rodrigues' formula.
 
-    The result is accurate near zero, and NaN for a vector that is not finite.
+    The result is accurate for short vectors. It is NaN if the vector is not finite.
     """
     x, y, z = np.asarray(vector_rad, dtype=np.float64).tolist()
     angle = sqrt(x * x + y * y + z * z)
@@ -136,7 +136,7 @@ class Pose(Protocol):
 
 
 def pose_matrix(pose: Pose) -> Floats:
-    """Return the transform (4, 4) of a pose, such as world_from_object."""
+    """Return the transform (4, 4) that a pose describes, such as world_from_object."""
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
@@ -178,7 +178,8 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """Return the pose (4, 4) of a body after a motion of `duration_s` with a constant twist.
+    """Return the pose (4, 4) of a body after it has moved for `duration_s` with a constant twist
+    (velocity).
 
     twist_world (6,): velocity of the body's origin (m/s), then angular velocity (rad/s).
     """
@@ -187,7 +188,7 @@ def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Fl
 
 
 def angle_between(a: Floats, b: Floats) -> float:
-    """Return the angle (rad, 0 to pi) between two vectors (3,), accurate for small angles."""
+    """Return the angle (rad, 0 to pi) between two vectors (3,). Small angles are also accurate."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     across = hypot(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     return atan2(across, ax * bx + ay * by + az * bz)

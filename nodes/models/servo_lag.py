@@ -1,11 +1,12 @@
-"""Estimate the lag of an arm behind its commands from commanded and measured joint angles.
+"""Estimate by how much time an arm lags behind its commands, from commanded and measured joint
+angles.
 
-The measured joint angles are compared with the commands that were sent earlier by each lag of a
-grid. The estimate is the lag at which the variance of the difference is smallest. For white noise,
-this is the maximum-likelihood estimate (Knapp and Carter, The generalized correlation method for
-estimation of time delay, 1976). The weight of old samples decays exponentially. The variance
-removes a constant difference due to gravity or an encoder offset. Therefore motion at constant
-velocity gives no information about the lag.
+The lags of a grid are tried. For each lag, the measured joint angles are compared with the commands
+that were sent by this lag earlier. The estimate is the lag at which the variance of the difference
+is smallest. For white noise, this is the maximum-likelihood estimate (Knapp and Carter, The
+generalized correlation method for estimation of time delay, 1976). The weight of old samples decays
+exponentially. The variance does not depend on a constant difference due to gravity or an encoder
+offset. Therefore motion at constant velocity gives no information about the lag.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 GRID_STEP_S = 0.004
-"""The step of the grid of lags, s. The minimum between grid points is computed with a parabola."""
+"""The step (s) of the grid of lags. A parabola gives the minimum between grid points."""
 
 MEMORY_S = 1.2
 """The time constant, in seconds, with which the weight of samples decays."""
@@ -27,35 +28,37 @@ MIN_OBSERVED_S = 1.0
 """The duration of observed motion that is required before the first estimate, s."""
 
 MIN_SPEED_RAD_PER_S = 0.01
-"""The standard deviation of the joints' speed below which no estimate is made."""
+"""The minimum standard deviation of the joints' speed. If it is smaller, no estimate is made."""
 
 MAX_MISFIT_RATIO = 0.05
-"""The fraction of the motion's variance above which unexplained variance prevents an estimate.
+"""The maximum fraction of the motion's variance that the lag leaves unexplained.
 
-If the fraction is larger, the arm does not move as commanded, or a joint has the wrong sign.
+If the fraction is larger, no estimate is made, because the arm does not move as commanded or a
+joint has the wrong sign.
 """
 
 CORRELATION_S = 0.1
-"""The time within which errors of the angles are correlated, s. Samples within this time count as
-one sample."""
+"""The time (s) within which errors of the joint angles are correlated. Samples within this time
+count as a single sample."""
 
 MIN_NOISE_RATIO = 0.2
-"""The minimum fraction of the variance of measured minus commanded angles that is attributed to
-noise.
+"""The minimum noise variance, as a fraction of the variance of measured minus commanded joint
+angles.
 
 This minimum accounts for the errors of the servo model.
 """
 
 MAX_UNCERTAINTY_S = 0.004
-"""The standard deviation (s) of an estimate above which the estimate is not used."""
+"""The maximum standard deviation (s) of an estimate that is used."""
 
 MAX_SLEW_S_PER_S = 0.02
-"""The maximum rate (s/s) at which the lag in use changes. The limit prevents jumps of the
-targets."""
+"""The maximum rate (s/s) at which the used lag changes. The limit prevents jumps of the arm's
+target positions."""
 
 HISTORY = 256
 MIN_COMMANDS = 4
-"""The minimum number of recorded commands that is required to use a measurement."""
+"""The minimum number of recorded commands. If fewer commands are recorded, measurements are not
+used."""
 
 MIN_STEP_S = 0.02
 """The minimum time between two measurements that are used, s.
@@ -79,7 +82,7 @@ class LagBounds:
     max_s: float
 
     def clip(self, lag_s: float) -> float:
-        """Return `lag_s`, limited to the minimum and maximum."""
+        """Return `lag_s`, limited to the range between the minimum and the maximum."""
         return min(max(lag_s, self.min_s), self.max_s)
 
 
@@ -87,8 +90,8 @@ class LagBounds:
 class LagEstimate:
     """An estimated lag (s) of an arm with its standard deviation (s).
 
-    tracking_error_rad: standard deviation of measured minus commanded joint angles at this lag
-        (norm over the joints).
+    tracking_error_rad: standard deviation of measured minus commanded joint angles at this lag, as
+        the norm over the joints.
     expected_error_rad: tracking error of a critically damped servo with this lag and motion.
     answer_delay_s: mean time from a command to the measurement.
     command_interval_s: mean interval between commands. Both means are weighted by the square of the
@@ -107,8 +110,8 @@ class ServoLagEstimator:
     """An estimator of the lag of one arm behind its commands.
 
     estimate: newest estimate; None before the first estimate.
-    lag_s: lag to use, in seconds, always within the bounds. The value starts at the initial lag and
-        changes slowly towards the estimate.
+    lag_s: lag that callers should use, in seconds. It is always within the bounds. The value starts
+        at the initial lag and changes slowly towards the estimate.
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
@@ -186,7 +189,7 @@ class ServoLagEstimator:
 
         measured (6,): measured joint angles, rad.
         wanted_s: times of the commands with which the angles are compared, one for each lag.
-        timing_s (2,): answer delay and command interval.
+        timing_s (2,): answer delay and command interval, s.
         step_s: weight of the measurement.
         """
         times, joints = self._times_s[: self._count], self._joints[: self._count]
@@ -218,8 +221,8 @@ class ServoLagEstimator:
             self._timing_s += weight / self._timing_weight * (timing_s - self._timing_s)
 
     def _solve(self) -> LagEstimate | None:
-        """Return the lag with the smallest variance, or None if the motion is insufficient for an
-        estimate.
+        """Estimate the lag as the value with the smallest variance. Return None if the motion is
+        insufficient for an estimate.
         """
         if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
             return None
@@ -261,8 +264,8 @@ def _are_joints(joints_rad: Floats) -> bool:
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Return the mean (6,) and the total variance after a value (6,) is added with the weight
-    `gain`.
+    """Add a value (6,) with the weight `gain` to a mean (6,) and a total variance, and return the
+    results.
     """
     deviation = value - mean
     return mean + gain * deviation, square + gain * (

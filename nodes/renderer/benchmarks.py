@@ -34,12 +34,13 @@ are the projector's images of the patterns `coordinate_ramp_x` and `coordinate_r
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure]
 """A function that returns an `ErrorMeasure`. Its arguments are a scene, the poses (4, 4) of the
-sheet's left and right edges, and the fingertip (3,), m, or None."""
+sheet's left and right edges, and the fingertip (3,), m. The fingertip is None if the sheet is not
+pushed."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 LOWER_BOUND, TWO_PASS_TRIANGLES = "lower_bound", "two_pass_triangles"
-"""The names of two benchmark methods: the lower bound of the time, and the method two_pass for a
-sheet of four triangles.
+"""The names of two benchmark methods. The first gives the lower bound of the time. The second is
+the method two_pass for a sheet that consists of four triangles.
 """
 CORRECTION_OF: dict[str, Correction] = {
     LOWER_BOUND: "none",
@@ -62,9 +63,8 @@ SPACING_M = 0.0025
 def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
     """Return the benchmark of all image correction methods for tilted and pushed sheets.
 
-    The cases are the cases of figures 11 and 13 in Furukawa et al. 2007, and the limits of the
-    scene's working range. solved: whether to include methods that need precomputed deflection
-    shapes.
+    The cases are those of figures 11 and 13 in Furukawa et al. 2007, and the limits of the scene's
+    working range. solved: whether to include methods that need precomputed deflection shapes.
     """
     return Family(
         name="correction",
@@ -77,11 +77,12 @@ def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Fa
 
 
 def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
-    """Return whether a correction method is specified for a tilt (degrees) and push depth (mm).
+    """Return whether a tilt (degrees) and a push depth (mm) are in the valid range of a correction
+    method.
 
-    The method `none` requires a sheet that is neither tilted nor pushed. `one_plane` requires a
-    sheet that is not pushed. `four_triangles` requires a push depth of at most
-    `MAX_TRIANGLES_DEPTH_M`. All methods except `none` are specified for tilts of up to 50 degrees.
+    The method `none` requires a sheet that is neither tilted nor pushed. The method `one_plane`
+    requires a sheet that is not pushed. The method `four_triangles` requires a push depth of at
+    most `MAX_TRIANGLES_DEPTH_M`. All methods except `none` are valid for tilts of up to 50 degrees.
     """
     max_triangles_mm = 1e3 * MAX_TRIANGLES_DEPTH_M
     if method == "none":
@@ -100,9 +101,9 @@ def roll_sheet(
 ) -> Floats:
     """Return the pose world_from_sheet (4, 4) of a tilted sheet that touches the object.
 
-    contact_m: contact point (x, y) on the sheet, m. If it is None, the sheet has rolled on a
-    cylinder without slip from zero tilt. For other objects, the centre of the sheet touches the
-    point nearest to the user.
+    contact_m: contact point (x, y) on the sheet, m. If it is None and the object is a cylinder, the
+    sheet has rolled from zero tilt without slipping. If it is None and the object is not a
+    cylinder, the sheet's centre touches the point nearest to the user.
     """
     if not isinstance(scene.object.geometry, Cylinder):
         return _lay_sheet(scene, tilt_rad, contact_m or (0.0, 0.0))
@@ -133,7 +134,7 @@ def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 
 def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """Return a copy of the scene whose projector has another resolution and illuminates the same
+    """Return a copy of the scene whose projector has another resolution but illuminates the same
     width.
     """
     projector = require_projector(scene)
@@ -187,7 +188,9 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet pose of a case, and a function that returns the error measure."""
+    """Return the predicted sheet pose for a case of the benchmark, and a function that returns the
+    error measure.
+    """
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
@@ -224,7 +227,7 @@ def _draw(
 def draw_coordinate_ramps(
     scene_renderer: SceneRenderer, method: str, sheet: SheetPose
 ) -> tuple[Image, Image]:
-    """Draw the projector's images of both coordinate ramps for one eye, and return them."""
+    """Draw the projector's images of both coordinate ramps for one eye, and return the images."""
     images = []
     for pattern in COORDINATE_RAMPS:
         display = Display(correction=CORRECTION_OF[method], stereo="mono", pattern=pattern)

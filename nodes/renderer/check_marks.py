@@ -1,9 +1,10 @@
-"""Place the projected marks with which the stereo camera checks the calibrations.
+"""Place the projected marks that the stereo camera uses to check the calibrations.
 
 A mark is a square of projector pixels with a known ray. If the poses of projector and camera in the
 scene are correct, the camera must see the mark on this ray. If the poses of the arms are correct,
-the mark must be on the sheet. Near a pushing finger, the displacement of the sheet is a known
-fraction of the finger's displacement. Therefore the marks show the true depth of the finger.
+the mark must be on the sheet. If a finger pushes the sheet, the displacement of the sheet near the
+finger is a known fraction of the finger's displacement. Therefore the marks show the true depth of
+the finger.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ FINGER_STEP_M = 0.001
 class CheckMarks:
     """The projected marks of one frame.
 
-    side_px: side of the squares. corners_px (n, 2): left column and top row of each of the n marks.
-    world_m (n, 3): centres of the marks on the sheet; NaN if a mark misses the sheet. finger_ratio
-    (n,): displacement of the sheet along its normal at each mark, divided by the displacement of
-    the fingertip.
+    side_px: side of the squares. corners_px (n, 2): pixel coordinates (left column, top row) of
+    each of the n marks. world_m (n, 3): centres of the marks on the sheet; NaN if a mark misses the
+    sheet. finger_ratio (n,): displacement of the sheet along its normal at each mark, divided by
+    the displacement of the fingertip.
     """
 
     side_px: int
@@ -57,8 +58,8 @@ def place_marks(
 ) -> CheckMarks:
     """Compute the check marks of a projector on the sheet.
 
-    world_from_sheet (4, 4): pose of the sheet. mesh: mesh of the sheet. deeper: mesh for a
-    fingertip that is `FINGER_STEP_M` deeper; None if there is no contact.
+    world_from_sheet (4, 4): pose of the sheet. mesh: current mesh of the sheet. deeper: mesh of the
+    sheet if the fingertip were `FINGER_STEP_M` deeper; None if there is no contact.
     """
     pose, lens = projector.world_from_projector, projector.lens
     world_from_projector = pose_matrix(pose)

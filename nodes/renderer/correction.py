@@ -1,20 +1,21 @@
 """Correct the projected image for a moved or pushed sheet (Furukawa et al. 2007, eq. (1)-(6)).
 
-The image is drawn for the imaginary screen, the fixed plane z = 0. The image is projected onto the
-actual screen, the sheet. V is the eye, P the projector and A a point of the object. C is the
-intersection of the line V-A with the actual screen. C' is the intersection of the line C-P with the
-imaginary screen. A' is the point of the line V-C' at the depth of A. If the point is drawn at A',
-the eye sees it at A.
+The image is drawn for the imaginary screen, which is the fixed plane z = 0. It is projected onto
+the actual screen, which is the sheet. V is the eye, P the projector and A a point of the object. C
+is the intersection of the line V-A with the actual screen. C' is the intersection of the line C-P
+with the imaginary screen. A' is the point of the line V-C' that has the same depth as A. If the
+point is drawn at A', the eye sees it at A.
 
-The actual screen is one plane, or the four triangles between the pushed point and the sheet's
-corners. All points are in the world frame, in m. A point is invalid and is not moved in two cases:
+The actual screen is either one plane, or four triangles between the pushed point and the sheet's
+corners. All points are in the world frame, in m. A point A is invalid and is not moved in two
+cases:
 
 - The eye or the projector sees the screen from the other side, or at an angle whose sine is below
     `GRAZING_SINE`.
 - The point is not in front of the eye, or its point C is behind the eye or the projector.
 
-The plane of the sheet replaces each triangle whose area is zero. It replaces all four triangles if
-the push is too shallow.
+If the area of a triangle is zero, the plane of the sheet replaces this triangle. If the push is too
+shallow, the plane replaces all four triangles.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from flexsheet.nodes.models.rigid import inverse
 
 GRAZING_SINE = 0.05
 """The sine of the minimum angle (2.9 degrees) between a ray and the sheet. At this angle, a pixel
-is stretched by a factor of 20."""
+on the sheet is stretched by a factor of 20."""
 
 NEAR_M = 0.02
-"""The minimum depth of drawn points in front of the eye."""
+"""The minimum distance (m) of drawn points in front of the eye."""
 
 MIN_PUSH_M = 1e-4
 """The minimum push depth for a screen of four triangles instead of a plane."""
@@ -73,8 +74,9 @@ def make_pushed_screen(
     """Return the screen of four triangles between the pushed point and the sheet's corners.
 
     pushed_point (3,), m. corners (4, 3): left bottom, right bottom, right top, left top, m. plane:
-    plane of the sheet without a push. It replaces each triangle whose area is zero, and all
-    triangles if the push is below `MIN_PUSH_M`. Source: section III-C 3 of Furukawa et al. 2007.
+    plane of the sheet as if it were not pushed. It replaces each triangle whose area is zero. It
+    replaces all triangles if the push depth is below `MIN_PUSH_M`. Source: section III-C 3 of
+    Furukawa et al. 2007.
     """
     if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
         return make_flat_screen(plane)
@@ -87,12 +89,13 @@ def make_pushed_screen(
 
 
 def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
-    """Return the unit normals (4, 3) of the planes through the eye, the pushed point and a corner.
+    """Return the unit normals (4, 3) of four planes, each through the eye, the pushed point and one
+    corner.
 
     As seen from the eye, the lines from the pushed point to the corners divide the image into one
     sector for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
-    If the screen is one plane, the normals are zero. A single normal is zero if its line points to
-    the eye. eye (3,): position of the eye, m.
+    If the screen is one plane, the normals are zero. A single normal is zero if the line to this
+    corner points to the eye. eye (3,): position of the eye, m.
     """
     if screen.corners is None:
         return np.zeros((4, 3))
@@ -125,8 +128,8 @@ def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
 def pixel_from_screen(lens: Lens, world_from_projector: Floats) -> Floats:
     """Return the homography (3, 3) from (x, y, 1), in m, on the plane z = 0 to projector pixels.
 
-    The projector is modelled as a pinhole, without lens distortion. world_from_projector (4, 4):
-    pose.
+    The projector is modelled as a pinhole that has no lens distortion. world_from_projector (4, 4):
+    pose of the projector.
     """
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]

@@ -32,14 +32,14 @@ VERSION = 2
 same inputs change."""
 
 STRETCH_SLACK = 0.01
-"""The margin by which the computed range of stretch ratios exceeds the limits of the scene at each
-end."""
+"""The margin by which the computed range of stretch ratios extends beyond each limit of the scene.
+"""
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
-"""The fields of `IndentationBasis` that the cache file contains."""
+"""The names of the fields of `IndentationBasis` that the cache file contains."""
 
 MAX_DEPTH_RATIO = 1.2
-"""The ratio of the maximum push depth in the computation to the push depth of the scene."""
+"""The maximum push depth that is computed, divided by the maximum push depth of the scene."""
 
 RADIUS_STEP_M, FIRST_RADIUS_M = 0.002, 0.003
 """The difference between successive stored radii of the finger, and the minimum stored radius."""
@@ -51,8 +51,9 @@ Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return the rubber of a scene's sheet, and the range of pushes with precomputed sheet
-    shapes."""
+    """Return the rubber of a scene's sheet, and the range of pushes for which sheet shapes are
+    precomputed.
+    """
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(
@@ -94,10 +95,10 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """List pairs (weight, scene) whose stored deflection shapes are interpolated for a given scene.
+    """List the scenes whose stored deflection shapes are interpolated for a given scene.
 
-    The listed scenes are copies of the given scene with a stored finger radius and a stored sheet
-    width.
+    The result consists of pairs (weight, scene). The listed scenes are copies of the given scene
+    that have a stored finger radius and a stored sheet width.
     """
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
@@ -132,7 +133,8 @@ def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> I
 
 
 def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
-    """Return the deflection shapes of a scene from the cache, or None if the cache lacks some.
+    """Load the deflection shapes of a scene from the cache. Return None if some of the shapes are
+    missing.
 
     cache_dir: folder of the cache; None selects the cache of the user.
     """
@@ -150,9 +152,8 @@ def load_or_compute(
 ) -> IndentationBasis:
     """Load the scene's deflection shapes from the cache, or compute and store them.
 
-    The computation uses all cores. cache_dir: folder of the cache; None selects the cache of the
-    user.
-    progress: function that receives the number of solved pushes and the total number.
+    The computation uses all cores. cache_dir: folder of the cache. If it is None, the cache of the
+    user is used. progress: function that receives the number of solved pushes and the total number.
     """
     return _combine(
         scene,

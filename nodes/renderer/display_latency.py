@@ -6,7 +6,8 @@ from collections import deque
 from statistics import median
 
 HISTORY = 31
-"""The number of recent frames from which latencies are computed: half a second at 60 Hz."""
+"""The number of recent frames from which latencies are computed. They cover half a second at 60 Hz.
+"""
 
 VSYNC_MARGIN_S = 0.0005
 """The minimum time (s) between the end of drawing and the buffer swap that shows the frame."""
@@ -19,7 +20,7 @@ class DisplayLatencyEstimator:
     """An estimator of the display time of a frame.
 
     The display time is the middle of the interval in which the frame is projected. All times are in
-    ns and are read from one clock. If there is a window, the display time is the time of the swap
+    ns and are from the same clock. If there is a window, the display time is the time of the swap
     (exchange of the window's buffers) plus a constant latency. If there is no window, the display
     time is the end of drawing plus this latency. If swaps wait for the projector's refresh, the
     prediction is based on the next swap for which the frame will be ready.
@@ -52,8 +53,8 @@ class DisplayLatencyEstimator:
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
     def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
-        """Record the drawing time of a frame that no window shows, and return the display time
-        (ns).
+        """Record a drawn frame if there is no window, and return the display time (ns) of the
+        frame.
 
         begun_ns, drawn_ns: start and end of drawing.
         """
@@ -73,10 +74,10 @@ class DisplayLatencyEstimator:
         return swapped_ns + self._light_ns
 
     def is_late(self, light_ns: int, predicted_ns: int) -> bool:
-        """Return whether a frame was displayed later than predicted.
+        """Return whether a frame was displayed too late.
 
-        A frame is late if it exceeds the prediction by more than the larger of half a refresh
-        period and the display latency.
+        A frame is too late if its display time exceeds the prediction by more than a tolerance. The
+        tolerance is half a refresh period or the display latency, whichever is larger.
 
         light_ns, predicted_ns: measured and predicted display time.
         """

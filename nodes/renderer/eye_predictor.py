@@ -13,8 +13,8 @@ from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.max_age import MaxAge
 
 WINDOW_S = 0.15
-"""The duration over which the eyes' velocity is measured, in seconds. It covers a few frames of a
-head tracker."""
+"""The duration, in seconds, over which the velocity of the eyes is measured. In this time, a head
+tracker sends a few positions."""
 
 MIN_MESSAGES = 3
 """The minimum number of positions from which a velocity is computed. With fewer positions, the
@@ -24,15 +24,15 @@ MAX_SPEED_M_PER_S = 1.0
 """The maximum plausible speed of a head. Larger velocities are ignored."""
 
 MAX_AHEAD_S = 0.1
-"""The maximum time over which a position is extrapolated."""
+"""The maximum time (s) over which a position is extrapolated."""
 
 MAX_SHIFT_M = 0.03
-"""The maximum distance by which a position is extrapolated."""
+"""The maximum distance (m) by which a position is extrapolated."""
 
 
 class EyePredictor:
-    """A predictor of the eyes' position. Its velocity is the slope of a line that is fitted to
-    recent positions.
+    """A predictor of the eyes' positions. It computes the velocity as the slope of a line that is
+    fitted to recent positions.
 
     max_age: maximum age of a message. If the last message is older, the predictor returns None.
     """
@@ -63,8 +63,8 @@ class EyePredictor:
     def predict(self, tracked: Input[Eye], horizon_s: float) -> Eye | None:
         """Return the eyes as predicted for a time `horizon_s` after the current time.
 
-        Return None if there is no message, or if the message is too old. An invalid message is
-        returned unchanged.
+        tracked: newest message with eye positions. Return None if there is no message, or if the
+        message is too old. An invalid message is returned unchanged.
         """
         eye, age_s = tracked.message, tracked.age_s()
         if eye is None or age_s > self._max_age.seconds:
@@ -78,7 +78,9 @@ class EyePredictor:
         return eye.model_copy(update={"centre_world_m": eye.centre_world_m + shift})
 
     def _velocity(self) -> Floats:
-        """Return the velocity (3,), in m/s, of the eyes; zero if it is unknown or implausible."""
+        """Return the velocity (3,), in m/s, of the eyes. The result is zero if the velocity is
+        unknown or implausible.
+        """
         if len(self._positions) < MIN_MESSAGES:
             return np.zeros(3)
         newest_ns = self._positions[-1][0]

@@ -30,15 +30,16 @@ from flexsheet.nodes.renderer.sheet_pose_predictor import SheetPosePredictor, pr
 from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
 
 VISIBLE_CHANGE_M = 1e-4
-"""The motion of the sheet that makes a new frame necessary, about a fifth of a pixel."""
+"""The displacement (m) of the sheet that makes a new frame necessary. It is about a fifth of a
+pixel."""
 
 FLANGE_TO_SHEET_M = 0.15
 """The maximum distance (m) between a point on the sheet's edge and the flange of the arm that holds
 the edge."""
 
 CHECK_MARKS_PERIOD_NS = 200_000_000
-"""The period with which the projected check marks are placed on the moving sheet. This period
-limits the computing time to 1 % of a processor core."""
+"""The minimum time (ns) between two computations of the projected check marks. With this period,
+the computations use at most 1 % of a processor core."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +56,8 @@ class RendererInputs:
 
 
 class FrameRenderer:
-    """A renderer that draws the frames of a scene, and counts late frames and frames that were
-    never shown.
+    """A renderer that draws the frames of a scene. It also counts frames that were late, and frames
+    that were never shown.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class FrameRenderer:
             self.extrapolator.add(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Return whether a new frame would equal the last frame, because no input has changed."""
+        """Return whether a new frame would equal the last frame because no input has changed."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)
@@ -100,7 +101,7 @@ class FrameRenderer:
         """Draw a frame, and return its message and the camera exposure time (ns) of its input data.
 
         begun_ns: start of drawing. with_pixels: whether the message contains the image. If there is
-        a window, the message has no display time until `on_shown` is called.
+        a window, `on_shown` later adds the display time to the message.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         self._drawn_of = (ports.skin.message, ports.eye.message, shown)
@@ -195,9 +196,9 @@ class FrameRenderer:
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the drawn object as predicted for the display time `light_ns`.
 
-        If the soft-body solver has not sent a recent response, its last response is used unchanged.
-        Return two times (ns): the exposure time of the data, and the time for which the deformation
-        was predicted.
+        If the last response of the soft-body solver is not recent, it is used without prediction.
+        Return two times (ns): the exposure time of the camera image from which the deformation was
+        computed, and the time for which the deformation was predicted.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds
@@ -215,7 +216,9 @@ class FrameRenderer:
 
 
 def is_touched(fingertip: Fingertip | None, soft_body: SoftBody | None) -> bool:
-    """Return whether the shape may change because a finger is tracked or the object is deformed."""
+    """Return whether the object can change its shape, because a finger is tracked or the object is
+    deformed.
+    """
     if fingertip is not None and fingertip.valid:
         return True
     return soft_body is not None and bool(soft_body.displacement_world_m.any())

@@ -31,10 +31,11 @@ SOFTWARE_DRIVERS = ("llvmpipe", "softpipe", "swrast")
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 GRID_PITCH_M = 0.02
 SCREEN_PATTERNS = ("grid", "checker", "white")
-"""The patterns that are drawn on the imaginary screen, the plane z = 0, instead of the object."""
+"""The patterns that can be drawn instead of the object. They are drawn on the imaginary screen,
+which is the plane z = 0."""
 SOFT_LOOK, FLAT_LOOK = 0, 1
 LOOKS = {"coordinate_ramp_x": 2, "coordinate_ramp_y": 3, "grid": 4, "checker": 5, "white": 6}
-"""The value of the macro LOOK in the shader `object.frag.glsl`, by pattern."""
+"""The value of the macro LOOK in the shader `object.frag.glsl` for each pattern."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
 MARK_RADIUS_M = 0.003
 
@@ -53,7 +54,7 @@ class EyeView:
     eye, projector: positions (3,), world frame, m. screen: shape of the sheet for which the image
     is corrected, or None if the image is not corrected. clip_from_screen: matrix (3, 3) from the
     imaginary screen, the plane z = 0, to OpenGL clip coordinates. lens: lens of the projector, or
-    None if the lens has no distortion. grey: whether to draw without colour.
+    None if the lens has no distortion. grey: whether to draw in shades of grey.
     """
 
     eye: Floats
@@ -68,9 +69,9 @@ class EyeView:
 class DrawStyle:
     """The style in which the object is drawn.
 
-    flat: whether to draw without shading. pattern: name of a test pattern, or "object".
+    flat: whether to draw the object unshaded. pattern: name of a test pattern, or "object".
     fingertip_mark, target_mark: points (3,) on the undeformed object, world frame, m, at which
-    marks are drawn, or None.
+    marks are drawn. None means that the mark is not drawn.
     """
 
     flat: bool
@@ -87,8 +88,8 @@ class DrawStyle:
 class ImagePart:
     """The part of the projector's image that one eye sees.
 
-    viewport: left, bottom, width and height, px. channels: for red, green and blue, whether the
-    channel is drawn.
+    viewport: left, bottom, width and height, px. channels: whether the red, the green and the blue
+    channel are drawn.
     """
 
     viewport: tuple[int, int, int, int]
@@ -100,7 +101,7 @@ class ImagePart:
 
     @contextmanager
     def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
-        """Restrict drawing to this part of a frame and its colour channels until the context
+        """Restrict drawing to the area and the colour channels of this part, until the context
         exits.
         """
         whole = frame.viewport
@@ -118,10 +119,10 @@ class SurfaceMaterial:
     """The colour and the texture of the object.
 
     colour: red, green and blue, from 0 to 1. texture: key of `TEXTURES`. pitch_m: period of the
-    procedural textures. image (height, width, 3): texture image, starting with the top row, or
-    None. image_from_world (4, 4): map from points of the object at rest to image coordinates. Image
-    coordinates are 0 at the left and bottom edges, and 1 at the opposite edges. object_from_world
-    (4, 4): inverse pose of the object.
+    procedural textures. image (height, width, 3): texture image, starting with the top row; None if
+    there is no texture image. image_from_world (4, 4): map from points of the undeformed object to
+    image coordinates. Image coordinates are 0 at the left and bottom edges, and 1 at the opposite
+    edges. object_from_world (4, 4): inverse pose of the object.
     """
 
     colour: tuple[float, float, float]
@@ -186,14 +187,14 @@ class Canvas:
     def set_shape(self, moved: Singles) -> None:
         """Set the current positions (m) and normals of the object's vertices, as an array (n, 6).
 
-        The normals may have any length. Raises ValueError if the array has another shape.
+        The normals can have any length. Raises ValueError if the array has another shape.
         """
         self._object.move(moved)
 
     def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw an image without averaging the samples of each pixel.
+        """Draw an image, but do not average the samples of each pixel.
 
-        Benchmarks use the time of this method as a lower bound for all correction methods.
+        Benchmarks use the time that this method needs as a lower bound for all correction methods.
         """
         self.begin(multisampled=True)
         self.draw_into(self.target, view, look)
@@ -249,7 +250,7 @@ class Canvas:
         return np.ascontiguousarray(rows[::-1])
 
     def shifted_points(self, view: EyeView) -> Floats:
-        """Return the vertex positions after the image correction, as the shader computes them.
+        """Return the vertex positions that the shader computes for the image correction.
 
         The result (n, 4) contains the position (m) and the validity (0 or 1) of each of the n
         vertices. Tests compare the result with a reference.
@@ -268,7 +269,9 @@ def _mark(point: Floats | None) -> tuple[float, ...]:
 
 
 class Uniforms:
-    """The uniforms of a shader program. Only changed values are written to OpenGL."""
+    """The uniforms (parameters) of a shader program. Only values that have changed are written to
+    OpenGL.
+    """
 
     def __init__(self, program: moderngl.Program) -> None:
         self._program = program
@@ -372,7 +375,7 @@ class _MeshBuffers:
 
 
 def _grid_surface() -> ObjectSurface:
-    """Return a square of 300 mm on the plane z = 0."""
+    """Return a square with sides of 300 mm on the plane z = 0."""
     cells = 60
     axis = np.linspace(-0.15, 0.15, cells + 1)
     x, y = np.meshgrid(axis, axis)
@@ -396,8 +399,9 @@ def limit_driver_threads() -> None:
     """Limit the threads of a software OpenGL driver to half of the cores.
 
     The other half remains free for other nodes. If there are at most two cores, the driver starts
-    no threads of its own, because threads that wait for one another on busy cores use additional
-    processor time. If the environment variable LP_NUM_THREADS is set, its value is used instead.
+    no threads of its own. Its threads would wait for one another on busy cores, which uses
+    additional processor time. If the environment variable LP_NUM_THREADS is set, its value is used
+    instead.
     """
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
@@ -409,8 +413,8 @@ def is_software(context: moderngl.Context) -> bool:
 
 
 def headless_context() -> moderngl.Context:
-    """Return an OpenGL 3.3 context without a window. Raises NoOpenGLError if the library EGL
-    provides none.
+    """Return an OpenGL 3.3 context that has no window. Raises NoOpenGLError if the library EGL
+    cannot create such a context.
     """
     limit_driver_threads()
     # The type stub accepts further settings only as a dict.

@@ -9,17 +9,17 @@ import numpy as np
 from flexsheet.messages.scene import Lens
 
 REACH_MARGIN = 1.1
-"""The ratio of the slope up to which the distortion must be invertible to the slope at the image's
-corners. The slope of a ray is the tangent of its angle to the optical axis."""
+"""The maximum slope at which the lens distortion must be invertible, divided by the slope at the
+image's corners. The slope of a ray is the tangent of its angle to the optical axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClipLens:
     """The parameters of the projector lens in OpenGL clip coordinates.
 
-    focal_centre: focal lengths and principal point (fx, fy, cx, cy). distortion: k1, k2, p1, p2 and
-    k3 of OpenCV. reach: maximum squared slope of a ray. The slope of steeper rays is limited to
-    this value, because the polynomial would map these rays back into the image.
+    focal_centre: focal lengths and principal point (fx, fy, cx, cy). distortion: coefficients k1,
+    k2, p1, p2 and k3, as in OpenCV. reach: maximum squared slope of a ray. Steeper rays are limited
+    to this slope, because the distortion polynomial would map them back into the image.
     """
 
     focal_centre: tuple[float, float, float, float]

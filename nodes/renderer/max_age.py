@@ -9,16 +9,16 @@ from flexsheet.messages.base import Header
 
 HISTORY = 15
 PERIODS = 4.0
-"""The maximum age of a message, in camera periods. This value permits the loss of three successive
-messages."""
+"""The maximum age of a message, in camera periods. With this value, three successive messages can
+be lost."""
 MIN_AGE_S, MAX_AGE_S = 0.1, 0.5
 
 
 class MaxAge:
     """The maximum age at which messages about poses, fingertips, eyes and soft bodies are used.
 
-    seconds: current maximum age, which is a fixed value or `PERIODS` measured periods of the
-    camera. The measured value is limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
+    seconds: current maximum age. It is either a fixed value, or `PERIODS` times the measured period
+    of the camera. In the second case, it is limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
     """
 
     def __init__(self, given_s: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Find the projector's monitor, and open a window on this monitor with the library GLFW.
+"""Find the monitor that is the projector, and open a window on it with the library GLFW.
 
 All functions must be called on the main thread.
 """
@@ -106,7 +106,7 @@ def _text(name: bytes | str) -> str:
 
 
 def refresh_period_s(monitor: Any) -> float:
-    """Return the current refresh period of a monitor, in seconds; 0 if the period is unknown."""
+    """Return the current refresh period of a monitor, in seconds, or 0 if the period is unknown."""
     rate_hz = glfw.get_video_mode(monitor).refresh_rate
     return 1.0 / rate_hz if rate_hz > 0 else 0.0
 

@@ -33,11 +33,12 @@ READ_TIME_NS = 2_000_000
 
 
 class Renderer(Node):
-    """Draw a frame for each soft-body message, at most at `rate_hz`.
+    """Draw a frame for each soft-body message, at a rate of at most `rate_hz`.
 
     If there are no recent soft-body messages, fingertip messages trigger frames. If there are no
     recent messages of either type, a timer triggers frames. If there is a window, the node
-    publishes a frame after the window has shown the frame; otherwise, after it is drawn.
+    publishes each frame after the window has shown it. Otherwise, the node publishes each frame
+    after it is drawn.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER
@@ -140,11 +141,11 @@ class Renderer(Node):
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
-        """Publish a frame that the window has shown. Any thread may call this method."""
+        """Publish a frame that the window has shown. Any thread is allowed to call this method."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
     def _reopen(self) -> None:
-        """Create the output and all graphics objects again after a loss of the OpenGL context."""
+        """Create the output and all graphics objects again after the OpenGL context was lost."""
         self.log.warning("window", problem=self._output.note)
         self._frame_renderer = None
         self._output.close()
@@ -180,7 +181,9 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish a frame that the window has shown or replaced by a newer frame."""
+        """Publish a frame that the window has shown, or that a newer frame has replaced before it
+        was shown.
+        """
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

@@ -1,9 +1,9 @@
 """Build the drawn mesh of the scene's object, and deform it with the solver's skin.
 
 The skin is the surface mesh of the soft-body solver. The drawn mesh is finer, and its vertices are
-on the true shape. A coarse mesh would have a visibly angular outline, and the image is corrected
-only at vertices (module `correction`). The displacement and the change of the normals are
-interpolated between the vertices of the skin.
+on the true shape. There are two reasons: the outline of a coarse mesh would be visibly angular, and
+the image is corrected only at vertices (module `correction`). The displacement and the change of
+the normals are interpolated between the vertices of the skin.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MIN_AROUND = 128
 """The minimum number of vertices around a cylinder, sphere or ellipsoid. It ensures a smooth
 outline."""
 CANDIDATES = 16
-"""The number of nearby sample points on the skin. Their triangles are searched for the nearest
+"""The number of nearby sample points on the skin whose triangles are searched for the nearest
 point."""
 
 
@@ -41,8 +41,8 @@ point."""
 class ObjectSurface:
     """The surface mesh of the object at rest.
 
-    rest_world_m (n, 3): vertices, with duplicates on sharp edges. normals_world (n, 3): unit
-    normals. triangles (t, 3): counter-clockwise as seen from outside.
+    rest_world_m (n, 3): positions of the vertices. Vertices on sharp edges are duplicated.
+    normals_world (n, 3): unit normals. triangles (t, 3): counter-clockwise as seen from outside.
     """
 
     rest_world_m: Floats
@@ -75,9 +75,9 @@ def make_surface(
 ) -> ObjectSurface:
     """Return the surface mesh of a geometry with vertices about `spacing_m` apart.
 
-    shape: shape of the geometry, which provides true points and normals. world_from_object (4, 4):
-    pose. A plane is drawn as a rectangle, and a mesh as the smooth surface that its shape defines.
-    Raises ValueError if the spacing requires too many triangles.
+    shape: shape of the geometry, which provides exact points and normals. world_from_object (4, 4):
+    pose of the object. A plane is drawn as a rectangle, and a mesh as the smooth surface that its
+    shape defines. Raises ValueError if the spacing requires too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -116,8 +116,8 @@ def cylinder_surface(
 ) -> ObjectSurface:
     """Return a closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
 
-    The vertices are the rings of the curved side, and then the rim and the centre of each end.
-    world_from_object (4, 4): pose.
+    The vertices of the rings on the curved side come first. The rim and the centre of each end
+    follow. world_from_object (4, 4): pose of the object.
     """
     rings = int(np.ceil(length_m / spacing_m)) + 1
     around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), MIN_AROUND)
@@ -152,7 +152,8 @@ def _cells(length_m: float, spacing_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Return points (n, 2) and triangles (t, 3) of a grid on the square from -0.5 to 0.5.
+    """Return points (n, 2) and triangles (t, 3) of a grid on a square. Both coordinates are from
+    -0.5 to 0.5.
 
     columns, rows: number of cells. The triangles are counter-clockwise.
     """
@@ -229,9 +230,9 @@ class DeformationTransfer:
     ) -> None:
         """Compute the interpolation weights between a drawn surface and the skin.
 
-        skin_vertices (s, 3): vertices at rest, world frame, m. skin_triangles (t, 3):
-        counter-clockwise as seen from outside. Raises ValueError if all triangles have zero area,
-        or if a coordinate is not finite.
+        skin_vertices (s, 3): undeformed vertices of the skin, world frame, m. skin_triangles (t,
+        3): counter-clockwise as seen from outside. Raises ValueError if all triangles have zero
+        area, or if a coordinate is not finite.
         """
         self.vertices = len(skin_vertices)
         self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
@@ -244,9 +245,8 @@ class DeformationTransfer:
     def apply(self, displacement: Singles) -> Singles:
         """Return positions (m) and normals, (n, 6), of the deformed drawn surface.
 
-        displacement (s, 3): displacement of the skin's vertices, m. The length of the normals is
-        arbitrary. Raises ValueError if the shape of the array is wrong, or if a value is not
-        finite.
+        displacement (s, 3): displacement of the skin's vertices, m. The normals need not have unit
+        length. Raises ValueError if the array has the wrong shape, or if a value is not finite.
         """
         if displacement.shape != self._skin.shape:
             raise ValueError(
@@ -269,12 +269,12 @@ class DeformationTransfer:
 def transfer_matrix(
     points: Floats, skin_vertices: Floats, skin_triangles: Indices
 ) -> scipy.sparse.csr_array:
-    """Return the matrix (n, s), float32, that interpolates values at s skin vertices at n points
+    """Return the matrix (n, s), float32, that interpolates values of s skin vertices at n points
     (n, 3).
 
     Each row contains the barycentric weights of the nearest point of the skin. skin_vertices (s,
-    3), skin_triangles (t, 3): skin. Triangles without area are ignored. Raises ValueError if all
-    triangles have zero area, or if a vertex is not finite.
+    3): vertices of the skin, m. skin_triangles (t, 3): vertex indices. A triangle is ignored if its
+    area is zero. Raises ValueError if all triangles have zero area, or if a vertex is not finite.
     """
     if not np.isfinite(skin_vertices).all():
         raise ValueError("skin.vertices_world_m is not finite; check the soft-body solver")

@@ -1,5 +1,6 @@
 """Select the eyes for which a frame is drawn, and the part of the projector's image for each
-eye."""
+eye.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +16,12 @@ from flexsheet.nodes.renderer.gl import ImagePart
 WhichEye = Literal["both", "left", "right"]
 
 MIN_EYE_DISTANCE_M = 0.05
-"""The minimum distance of an eye from the imaginary screen, the plane z = 0."""
+"""The minimum distance (m) of an eye from the imaginary screen, which is the plane z = 0."""
 
 
 def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
     """Return the eye positions for drawing, the unit vector (3,) from the left to the right eye,
-    and a note.
+    and a note for the user.
 
     eyes: eye positions of the scene, which are used if no eyes are tracked. tracked: newest message
     of the topic eye; None if there is no message, or if the message is too old. The note is the
@@ -50,8 +51,8 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
 def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
     """Return the world positions (2, 3), in m, of the left and the right eye.
 
-    The positions are equal in mono mode. across: unit vector (3,) from the left to the right eye;
-    None selects the x axis.
+    The positions are equal in mono mode. across: unit vector (3,) from the left to the right eye.
+    If it is None, the x axis is used.
     """
     direction = np.array([1.0, 0.0, 0.0]) if across is None else across
     half = 0.0 if mode == "mono" else 0.5 * eyes.interocular_m
@@ -64,8 +65,8 @@ def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
     """Return the eye or eyes for which a frame is drawn.
 
     number: number of the frame. shows_both: whether the output itself alternates between the eyes.
-    In this case, each frame needs both images. Otherwise, odd frames are for the left eye in the
-    mode frame_sequential, and even frames for the right eye.
+    In this case, each frame needs both images. Otherwise, in the mode frame_sequential, odd frames
+    are for the left eye and even frames for the right eye.
     """
     if mode != "frame_sequential" or shows_both:
         return "both"
@@ -79,7 +80,8 @@ def select_drawn_eyes(
 
     pair (2, 3): positions of the left and right eye. which: eye or eyes to which the projector
     shows the frame. swap_eyes: whether the shutter glasses open in the opposite order. In this
-    case, a frame for one eye is drawn for the other eye. A frame for both eyes ignores `swap_eyes`.
+    case, a frame for one eye is drawn for the other eye. If the frame is for both eyes, `swap_eyes`
+    has no effect.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)

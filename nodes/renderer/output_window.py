@@ -48,7 +48,7 @@ class OutputWindow(Protocol):
 
 
 class OffscreenOutput:
-    """An output without a window. Images are drawn, and can be added to frame messages."""
+    """An output that has no window. Images are only drawn, and can be added to frame messages."""
 
     is_seen = shows_both = False
     period_s = 0.0
@@ -61,10 +61,10 @@ class OffscreenOutput:
         """Do nothing, because there is no window."""
 
     def store(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Do nothing, because images are not stored."""
+        """Do nothing, because an offscreen output shows no images."""
 
     def show(self, tag: Any, display: Display) -> None:
-        """Do nothing, because images are not shown."""
+        """Do nothing, because an offscreen output has no window."""
 
     def poll(self) -> bool:
         return True
@@ -76,7 +76,7 @@ class OffscreenOutput:
 def open_output(
     parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown
 ) -> OutputWindow:
-    """Open the output that the parameters select: offscreen, or a window.
+    """Open the output that the parameters select, which is an offscreen output or a window.
 
     now_ns: function that returns the current time. shown: function that receives the tag and the
     swap time, ns, of each shown image. Raises WindowError if the window cannot be opened, and
@@ -108,11 +108,11 @@ class ProjectorWindow:
     ) -> None:
         """Create the drawing context.
 
-        monitor: name or number of the monitor; None selects an ordinary window, for tests.
-        swap_interval: number of monitor refreshes per shown image. If it is 0, swaps do not wait
-        for the refresh, and images can tear. now_ns: function that returns the current time. shown:
-        function that receives the tag and the swap time, ns, of each shown image. Raises
-        WindowError if there is no display or no such monitor.
+        monitor: name or number of the monitor. If it is None, an ordinary window is opened, which
+        is useful for tests. swap_interval: number of monitor refreshes per shown image. If it is 0,
+        swaps do not wait for the refresh, and images can tear. now_ns: function that returns the
+        current time. shown: function that receives the tag and the swap time, ns, of each shown
+        image. Raises WindowError if there is no display or no such monitor.
         """
         limit_driver_threads()
         start_glfw()
@@ -130,7 +130,8 @@ class ProjectorWindow:
         self._filling: Slot | None = None
 
     def open(self, size: tuple[int, int]) -> None:
-        """Open the window for images of a size (width, height), px, unless it is already open.
+        """Open the window for images of a given size (width, height), px, unless the window is
+        already open.
 
         Raises WindowError if the monitor has no mode of this size.
         """
@@ -181,7 +182,7 @@ class ProjectorWindow:
         self._presenter.put(slot)
 
     def poll(self) -> bool:
-        """Handle the window's events, and return False if the graphics context was lost.
+        """Handle the window's events, and return false if the graphics context was lost.
 
         After a loss, `note` contains the reason, and the caller must create the output again. If
         the user has closed the window, `note` reports this, and the window is not opened again.

@@ -41,9 +41,9 @@ class RendererParameters(NodeParameters):
     )
     display_latency_s: NonNegative = Field(
         default=0.008,
-        description="Time, s, from the swap to the middle of the frame's display, which is half "
-        "of the time for which a frame is shown, plus the projector's delay. Without a window, it "
-        "starts at the end of drawing.",
+        description="Time, s, from the swap to the middle of the frame's display. This is half of "
+        "the time for which a frame is shown, plus the projector's delay. Without a window, the "
+        "time starts at the end of drawing.",
     )
     max_age_s: Positive | None = Field(
         default=None,

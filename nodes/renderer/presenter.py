@@ -1,7 +1,7 @@
 """Show the newest image in a window from a separate thread.
 
-A buffer swap that waits for the projector's refresh blocks only this thread. During this time, the
-event loop draws the next image. Both threads have their own OpenGL context, but share textures.
+A buffer swap that waits for the projector's refresh blocks only this thread. The event loop draws
+the next image in the meantime. Both threads have their own OpenGL context, but share textures.
 There are three pairs of textures (triple buffering): a shown pair, a completely drawn pair, and a
 pair for the next image.
 """
@@ -25,8 +25,8 @@ from flexsheet.nodes.renderer.monitors import WindowError, glfw_errors
 SLOTS = 3
 IDLE_S = 0.1
 REDRAW_COUNT = 4
-"""The number of times that an image is shown again after the window was resized. Some drivers
-resize their buffers only after two more buffer swaps."""
+"""The number of times that the image is shown again after the window was resized. The repetition is
+necessary because some drivers resize their buffers only after two more buffer swaps."""
 
 _NO_WINDOW: Any = None
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
@@ -41,8 +41,8 @@ class Slot:
     """The textures of one frame, and the stereo mode of the frame.
 
     In the mode frame_sequential, the textures contain the images for the left and the right eye.
-    Other modes use only the first texture. tag: object of the caller that identifies the frame.
-    swap_eyes: whether to exchange the images.
+    Other modes use only the first texture. tag: object with which the caller identifies the frame.
+    swap_eyes: whether to exchange the images of the two eyes.
     """
 
     textures: tuple[moderngl.Texture, moderngl.Texture]
@@ -59,7 +59,7 @@ def make_slot(context: moderngl.Context, size: tuple[int, int]) -> Slot:
 
 
 class Presenter:
-    """A thread that owns a window's OpenGL context and shows the images passed to `put`."""
+    """A thread that owns a window's OpenGL context and shows the images given to `put`."""
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class Presenter:
             )
 
     def put(self, slot: Slot) -> None:
-        """Hand a completely drawn slot to the thread, and return immediately.
+        """Pass a completely drawn slot to the thread, and return immediately.
 
         The thread shows the slot at the next refresh, unless a newer slot replaces it.
         """
@@ -133,7 +133,7 @@ class Presenter:
     def _next(self) -> tuple[Slot, bool] | None:
         """Wait for the next slot to show.
 
-        Return the slot and whether it is new, or None after a call of `stop`.
+        Return the slot and whether the slot is new. Return None if `stop` was called.
         """
         with self._changed:
             while not self._stop:

@@ -1,9 +1,9 @@
 """Correct the image in two passes (projective texture mapping).
 
 The first pass draws the object as the eye must see it through a rectangle on the imaginary screen
-(the plane z = 0). The second pass draws the sheet's mesh from the position of the projector, with
-the first image as its texture. The method is exact for any shape of the sheet and any depth of the
-object, and has no seams between triangles.
+(the plane z = 0). The second pass draws the sheet's mesh as seen from the projector. The texture of
+the mesh is the image of the first pass. The method is exact for any shape of the sheet and any
+depth of the object. The image has no seams between triangles.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class EyePicture:
 
 
 class TwoPassProjector:
-    """A renderer of the image correction in two passes."""
+    """A renderer that corrects the image in two passes."""
 
     def __init__(self, context: moderngl.Context, *, samples: int = SAMPLES) -> None:
         """Prepare the shaders.
@@ -109,7 +109,8 @@ class TwoPassProjector:
     ) -> None:
         """Draw the projector's image for one eye into a part of the framebuffer `canvas.target`.
 
-        window: rectangle that the eye's image shows. size: width and height of the eye's image, px.
+        window: rectangle on the imaginary screen that the eye's image covers. size: width and
+        height of the eye's image, px.
         """
         if size not in self._pictures:
             self._pictures[size] = EyePicture.make(self._context, size, self._samples)

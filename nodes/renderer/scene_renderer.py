@@ -59,18 +59,20 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 
 OVERSAMPLING, UNSAMPLED_OVERSAMPLING = 1.5, 2.5
 """The resolution of the eye's image (first pass of two_pass), divided by the resolution of the
-projector. The first value is used with multisampling, and the second value without multisampling.
-On a software driver, the variant without multisampling needs a quarter less time for equally smooth
-edges.
+projector. The first value is used if multisampling is on, and the second value if it is off. On a
+software driver, drawing with the second value needs a quarter less time, and the edges are equally
+smooth.
 """
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""The margin (m) around the object in the eye's image, and the step (m) to which the edges of the
-image are rounded. Rounding prevents flicker of the outline when the object moves."""
+"""The margin (m) around the object in the eye's image, and a step (m). The edges of the image are
+rounded to multiples of this step. This prevents flicker of the outline when the object moves."""
 MAX_WINDOW_M = 0.3
-"""The maximum distance of the edges of the drawn rectangle from the centre of the screen."""
+"""The maximum distance (m) of the edges of the drawn rectangle from the centre of the imaginary
+screen."""
 MIN_REPORTED_FRACTION = 0.005
-"""The minimum fraction of the sheet that must be dark, because of folds, before a note reports it.
+"""The minimum fraction of the sheet that is dark because of folds. If the fraction is smaller, no
+note reports it.
 """
 NO_SHAPES_NOTE = (
     "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles; "
@@ -83,8 +85,8 @@ GRID_WINDOW = ScreenRectangle(-0.151, -0.151, 0.302, 0.302)
 def projector_homography(scene: Scene) -> Floats:
     """Return the homography (3, 3) from the plane z = 0 of the world frame to projector pixels.
 
-    Points of the plane, the imaginary screen of Furukawa et al. 2007, are (x, y) in m. The pixels
-    belong to a projector whose lens has no distortion.
+    The plane is the imaginary screen of Furukawa et al. 2007. Its points are (x, y) in m. The
+    pixels are those of a projector whose lens has no distortion.
     """
     projector = require_projector(scene)
     return pixel_from_screen(projector.lens, pose_matrix(projector.world_from_projector))
@@ -105,9 +107,9 @@ class SceneRenderer:
     ) -> None:
         """Create the graphics objects of the scene.
 
-        spacing_m: distance between the vertices of the object. samples: samples per pixel; None
-        selects `SAMPLES`, but no multisampling in the first pass of two_pass if the OpenGL driver
-        is a software driver.
+        spacing_m: distance between the vertices of the object. samples: samples per pixel. If it is
+        None, `SAMPLES` is used. With a software driver, the first pass of two_pass then uses no
+        multisampling.
         basis: deflection shapes of the sheet; if it is None, a pushed sheet is drawn as four
         triangles.
         sheet_shape: method that computes the shape of the sheet. Raises ValueError if the
@@ -168,7 +170,9 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Set the solver's surface mesh, whose displacement deforms the drawn object."""
+        """Set the surface mesh of the soft-body solver. The displacement of this mesh deforms the
+        drawn object.
+        """
         vertices = skin.vertices_world_m.astype(np.float64)
         self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
@@ -176,9 +180,9 @@ class SceneRenderer:
     def deform(self, body: SoftBody | None) -> None:
         """Deform the drawn surface by the displacements from the soft-body solver.
 
-        body: message of the solver; if it is None, the surface is drawn at rest. Raises ValueError
-        and leaves the surface unchanged if the displacement does not fit the current skin or is not
-        finite.
+        body: message of the solver; if it is None, the undeformed surface is drawn. Raises
+        ValueError if the displacement does not fit the current skin or is not finite. The surface
+        is then unchanged.
         """
         if body is self._drawn_body:
             return
@@ -201,8 +205,8 @@ class SceneRenderer:
     ) -> DrawStyle:
         """Return the drawing style for a display message.
 
-        If the message requests marks, the style contains marks at the finger and at the contact
-        point of the target. finger_tip (3,): world position (m) at the display time; None if it is
+        If the message requests marks, the style contains marks at the finger and at the target's
+        contact point. finger_tip (3,): world position (m) at the display time; None if it is
         unknown.
         """
         marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
@@ -225,7 +229,9 @@ class SceneRenderer:
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> SheetPose:
-        """Return an unstretched sheet on the plane z = 0, for use before the first arm poses."""
+        """Return an unstretched sheet on the plane z = 0, which is used until the poses of the arms
+        are known.
+        """
         half = 0.5 * self.scene.sheet.width_m * np.array([1.0, 0.0, 0.0])
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
@@ -233,7 +239,8 @@ class SceneRenderer:
     def usable(self, sheet: SheetPose, centre: Floats | None = None) -> bool:
         """Return whether the eyes see the front of a sheet and the projector illuminates its back.
 
-        centre (3,): world position (m) of the midpoint of the eyes; None for the eyes of the scene.
+        centre (3,): world position (m) of the midpoint of the eyes. If it is None, the eyes of the
+        scene are used.
         """
         eye = self.scene.eyes.centre_world_m if centre is None else centre
         return is_plane_usable(sheet.plane, eye, self._world_from_projector[:3, 3])
@@ -255,12 +262,14 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image, and return it (height, width, 3) if `read` is true.
+        """Draw the projector's image. Return an array (height, width, 3) if `read` is true,
+        otherwise None.
 
-        eyes (1 or 2, 3): positions of the eyes, world frame, m; None selects the eyes of the scene.
-        Two eyes share the image, except in the mode frame_sequential. This mode has two images. The
-        image of the left eye is returned. drawn: function that receives the index of each image
-        when the image is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
+        eyes (1 or 2, 3): positions of the eyes, world frame, m. If `eyes` is None, the eyes of the
+        scene are used. If there are two eyes, they share one image. In the mode frame_sequential,
+        there are two images instead, and the image of the left eye is returned. drawn: function
+        that receives the index of each image as soon as the image is in `canvas.resolved`. Raises
+        ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")
@@ -280,7 +289,9 @@ class SceneRenderer:
         )
 
     def place_check_marks(self, sheet: SheetPose) -> CheckMarks:
-        """Place the projected marks that check the calibrations. The next images contain them."""
+        """Place the projected marks with which the calibrations are checked. The next images
+        contain these marks.
+        """
         note, pushed_point, deeper = self.note, sheet.pushed_point, None
         if pushed_point is not None and self.sheet_shape == "reduced_order" and self.basis:
             deeper_point = pushed_point - FINGER_STEP_M * sheet.world_from_sheet[:3, 2]
@@ -340,7 +351,7 @@ class SceneRenderer:
         """Return the geometry of one eye's image.
 
         eye (3,): position, world frame, m. screen: shape of the sheet for which the image is
-        corrected; None for no correction.
+        corrected. If it is None, the image is not corrected.
         """
         projector = self._world_from_projector[:3, 3]
         return EyeView(eye, projector, screen, self._clip_from_screen, self._lens, grey)
@@ -378,8 +389,8 @@ class SceneRenderer:
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
         """Compute the mesh of the sheet by the method `sheet_shape`.
 
-        If there are no deflection shapes, four triangles replace the method reduced_order. Then the
-        attribute `note` reports the limits of this method.
+        If there are no deflection shapes, a mesh of four triangles replaces the method
+        reduced_order. In this case, the attribute `note` reports the limits of the four triangles.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
             lacks_shapes = self.sheet_shape == "reduced_order"
@@ -407,8 +418,8 @@ class SceneRenderer:
         )
 
     def _report_folds(self, mesh: SheetMesh, eye: Floats) -> None:
-        """Compute the fraction of the sheet that gets no light due to folds, and report it in
-        `note`.
+        """Compute the fraction of the sheet that is dark because of folds, and report it in the
+        attribute `note`.
         """
         self.occluded_fraction = occluded_fraction(mesh, eye, self._world_from_projector[:3, 3])
         if self.occluded_fraction > MIN_REPORTED_FRACTION:
@@ -418,7 +429,7 @@ class SceneRenderer:
             self.note = "; ".join(filter(None, (self.note, folds)))
 
     def _window(self, eye: Floats) -> ScreenRectangle:
-        """Return the rectangle of the plane z = 0 that the object covers as seen from an eye (3,).
+        """Return the rectangle on the plane z = 0 that the object covers as seen from an eye (3,).
 
         Points that are not in front of the eye are excluded. `MAX_WINDOW_M` limits the rectangle.
         """

@@ -18,15 +18,16 @@ from flexsheet.nodes.renderer.correction import (
 )
 
 MIN_EDGE_DISTANCE_M = 0.05
-"""The minimum plausible distance between the sheet's edges."""
+"""The minimum plausible distance (m) between the sheet's edges."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPose:
     """The sheet as predicted for the display time of a frame, in the world frame.
 
-    world_from_sheet (4, 4): pose. corners (4, 3): left bottom, right bottom, right top, left
-    top, m. pushed_point (3,): fingertip that pushes the sheet, m, or None.
+    world_from_sheet (4, 4): pose of the sheet. corners (4, 3): left bottom, right bottom, right
+    top, left top, m. pushed_point (3,): position of the fingertip that pushes the sheet, m; None if
+    no finger pushes the sheet.
     """
 
     world_from_sheet: Floats
@@ -45,7 +46,9 @@ class SheetPose:
 
     @property
     def contact_point(self) -> Floats:
-        """Return the pushed point (3,), m, or the centre of the sheet if there is no push."""
+        """Return the pushed point (3,), m, or the centre of the sheet if no finger pushes the
+        sheet.
+        """
         return self.plane.point if self.pushed_point is None else self.pushed_point
 
 
@@ -61,11 +64,11 @@ def estimate_sheet(
     """Predict the pose and the pushed point of the sheet from the measured poses (4, 4) of its
     edges.
 
-    finger_tip (3,): predicted fingertip, world frame, m, or None. The fingertip pushes the sheet if
-    it is below the plane and within the outline of the sheet. twist_world (6,): linear (m/s) and
-    angular (rad/s) velocity of the sheet; None if the sheet is at rest. ahead_s: time from the
-    measurement to the prediction. Return None if the edges are closer than `MIN_EDGE_DISTANCE_M`,
-    or if a value is not finite.
+    finger_tip (3,): predicted position of the fingertip, world frame, m; None if it is unknown. The
+    fingertip pushes the sheet if it is below the plane and within the outline of the sheet.
+    twist_world (6,): linear (m/s) and angular (rad/s) velocity of the sheet; None if the sheet is
+    at rest. ahead_s: time from the measurement to the prediction. Return None if the edges are
+    closer than `MIN_EDGE_DISTANCE_M`, or if a value is not finite.
     """
     twist_world = np.zeros(6) if twist_world is None else twist_world
     left, right = world_from_left_edge, world_from_right_edge
@@ -87,9 +90,9 @@ def estimate_sheet(
 
 
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
-    """Return the shape of the sheet for which a method corrects the image.
+    """Return the shape of the sheet for which a correction method corrects the image.
 
-    Return None for the methods none and two_pass, because these methods need no screen.
+    Return None if the method is none or two_pass, because these methods need no shape.
     """
     if method in ("none", "two_pass"):
         return None

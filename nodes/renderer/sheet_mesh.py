@@ -1,4 +1,6 @@
-"""Build a flat, four-triangle or deflected mesh of the sheet for the two-pass correction."""
+"""Build a mesh of the sheet for the two-pass correction. The mesh is flat, deflected, or consists
+of four triangles.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,9 @@ PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 class SheetMesh:
     """A mesh of the sheet.
 
-    vertices (n, 3): world frame, m. triangles (m, 3): counter-clockwise as seen by the user. note:
-    reason why the shape is inaccurate; empty if the shape is accurate.
+    vertices (n, 3): positions in the world frame, m. triangles (t, 3): vertex indices,
+    counter-clockwise as seen by the user. note: reason why the shape is inaccurate; empty if the
+    shape is accurate.
     """
 
     vertices: Floats
@@ -42,7 +45,9 @@ class SheetMesh:
 
 
 def flat_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the mesh of an undeflected sheet, with four triangles between corners and centre."""
+    """Return the mesh of an undeflected sheet. It consists of four triangles between the corners
+    and the centre.
+    """
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
@@ -58,7 +63,7 @@ def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
 
 
 def refine_mesh(mesh: SheetMesh) -> SheetMesh:
-    """Halve the edges of a mesh `HALVINGS` times without changing its surface.
+    """Halve the edges of a mesh `HALVINGS` times. The surface of the mesh does not change.
 
     The lens distortion is applied only at vertices, so a finer mesh is more accurate.
     """
@@ -77,7 +82,7 @@ def refine_mesh(mesh: SheetMesh) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""A variant of `triangulate_grid` with a cache."""
+"""A variant of `triangulate_grid` that caches its results."""
 
 
 def deflected_mesh(
@@ -133,7 +138,7 @@ def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
 
     A triangle gets no light if it faces away from the projector, or if the projector sees it
     edge-on. The area of a dark triangle counts twice, because the triangle casts a shadow of about
-    the same area. eye, projector (3,): positions, world frame, m.
+    the same area on the sheet. eye, projector (3,): positions, world frame, m.
     """
     # One array for each coordinate is several times faster than an array of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)

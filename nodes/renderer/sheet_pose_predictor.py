@@ -16,8 +16,8 @@ from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 class SheetPosePredictor:
     """A predictor of the sheet's pose from the measured flange poses of the arms.
 
-    If no valid pose is newer than `max_age`, the predictor returns the last valid sheet. In this
-    case, the attribute `note` contains the reason. Otherwise, `note` is empty.
+    If no valid pose of the sheet is newer than `max_age`, the predictor returns the last valid
+    pose. In this case, the attribute `note` contains the reason. Otherwise, `note` is empty.
     """
 
     def __init__(self, max_age: MaxAge) -> None:
@@ -36,10 +36,12 @@ class SheetPosePredictor:
         horizon_s: float,
         eye: Floats,
     ) -> SheetPose:
-        """Return the predicted sheet at the time `horizon_s` after the current time.
+        """Return the pose of the sheet that is predicted for the time `horizon_s` after the current
+        time.
 
-        Before the first valid pose, return the sheet at rest. finger_tip (3,): fingertip at the
-        predicted time, world frame, m, or None. eye (3,): midpoint of the eyes, world frame, m.
+        Before the first valid pose, return the sheet at rest. finger_tip (3,): position of the
+        fingertip at this time, world frame, m; None if it is unknown. eye (3,): midpoint of the
+        eyes, world frame, m.
         """
         sheet, age_s = None, max(left.age_s(), right.age_s())
         if (
@@ -75,7 +77,8 @@ class SheetPosePredictor:
 def predict_fingertip(
     finger: Input[Fingertip], horizon_s: float, *, max_age_s: float
 ) -> Floats | None:
-    """Return the fingertip (3,), world frame, m, at a time `horizon_s` after the current time.
+    """Return the predicted position (3,), world frame, m, of the fingertip at the time `horizon_s`
+    after the current time.
 
     Return None if the fingertip message is invalid or older than `max_age_s`.
     """

@@ -1,7 +1,7 @@
 """Measure the time and the error of the methods that compute the shape of a pushed sheet.
 
 The error is the difference in height (world z) between the mesh of a method and a reference sheet.
-The error is computed at the points of the reference. The caller provides the reference.
+The error is computed at the points of the reference sheet, which the caller provides.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.29, 0.0),
     ("near the free edge", 0.0, 0.35),
 )
-"""The names of push positions, and their coordinates x and y from the centre as fractions of width
-and height."""
+"""The names and coordinates of the push positions. The coordinates x and y are measured from the
+sheet's centre, as fractions of the sheet's width and height."""
 
 
 def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:

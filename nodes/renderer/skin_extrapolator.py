@@ -1,8 +1,8 @@
 """Extrapolate the responses of the soft-body solver to the display time of a frame.
 
-A response contains the displacement of the object's surface for one moment, the camera exposure
-plus `prediction_horizon_s`. The frame is displayed tens of milliseconds later. Each vertex is
-extrapolated linearly from an older and the newest response.
+A response contains the displacement of the object's surface at one moment: the camera exposure plus
+`prediction_horizon_s`. The frame is displayed tens of milliseconds after this moment. Each vertex
+is extrapolated linearly from an older and the newest response.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from flexsheet.messages.types import SoftBody
 
 HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
-"""The limits of the time between the two responses that are extrapolated, in seconds. A shorter
-time amplifies noise, and a longer time causes lag."""
+"""The minimum and maximum time, in seconds, between the two responses that are extrapolated. A
+shorter time amplifies noise, and a longer time causes lag."""
 
 MAX_PERIOD_S = 0.12
 """The maximum time (s) between two successive responses. If the time is longer, they are not
@@ -34,8 +34,8 @@ class SkinExtrapolator:
         self._clock_id = ""
 
     def add(self, body: SoftBody, header: Header) -> None:
-        """Add a response. If its skin mesh, method or clock differs, delete all earlier
-        responses.
+        """Add a response. If its skin mesh, method or clock differs from the earlier responses,
+        delete the earlier responses.
         """
         last = self._history[-1][1] if self._history else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
@@ -49,8 +49,9 @@ class SkinExtrapolator:
         """Return the response extrapolated to the time `at_ns` of a clock, and the time (ns) for
         which it is valid.
 
-        Return the newest response unchanged if it has another clock, if it is later than `at_ns`,
-        or if no earlier response is suitable. Return None and 0 before the first response.
+        Return the newest response unchanged if it is from another clock, if it is later than
+        `at_ns`, or if no earlier response is suitable. Before the first response, return None and
+        0.
         """
         if not self._history:
             return None, 0

@@ -11,17 +11,18 @@ from flexsheet.nodes.fem_solver.mesh.quality import MIN_JACOBIAN_RATIO, min_jaco
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES, boundary_faces
 
 MAX_SAG_RATIO = 0.25
-"""The maximum displacement of an edge's midpoint, divided by the length of the edge. A surface
-point at a larger distance is on the opposite side of a thin part."""
+"""The maximum displacement of an edge's midpoint, divided by the length of the edge. If the nearest
+surface point is farther away, it is on the opposite side of a thin part."""
 
 
 def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Floats]) -> Floats:
     """Move the midpoints of boundary edges to the nearest surface points, and return all nodes (n,
     3).
 
-    nodes (n, 3), m, elements (e, 10): mesh with straight edges. nearest: function that returns the
-    nearest surface points. The edges of an element remain straight if its Jacobian determinant
-    would decrease below `MIN_JACOBIAN_RATIO` times the determinant of the straight element.
+    nodes (n, 3): nodes of a mesh with straight edges, m. elements (e, 10): node indices. nearest:
+    function that returns the nearest surface points. The edges of an element remain straight if its
+    Jacobian determinant would decrease below `MIN_JACOBIAN_RATIO` times the determinant of the
+    straight element.
     """
     middles = np.unique(boundary_faces(elements)[:, 3:])
     result = nodes.copy()

@@ -29,8 +29,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 )
 
 FOCUS_GROWTH = 0.35
-"""The increase of the element size per distance (m/m) from the focus, which is the point of the
-push."""
+"""The increase of the element size per distance (m/m) from the focus, which is the pushed point."""
 MAX_SIZE_RATIO = 0.35
 """The maximum element size of a mesh that is fine only near a focus point, as a fraction of the
 radius of the cylinder."""
@@ -43,7 +42,7 @@ class Focus:
 
     x_m: position along the axis. angle_rad: angle from +z. near_m: distance within which elements
     have the requested size. growth: increase of the element size per distance beyond `near_m`
-    (m/m); None selects `FOCUS_GROWTH`.
+    (m/m). If it is None, `FOCUS_GROWTH` is used.
     """
 
     x_m: float
@@ -68,9 +67,9 @@ def cylinder_mesh(
     angle of the touchable skin, which is centred on +z. skin_spacing_m: distance between touchable
     nodes. focus: point around which the mesh is fine; if it is None, the mesh is fine on all
     touchable skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for
-    y = 0. The mesh contains only the half with positive coordinates. Elements are larger inside and
-    at the back of the cylinder. Raises ValueError if the spacing is too large for the cylinder, or
-    if the angles are invalid.
+    y = 0. For each axis, the mesh contains only the half with positive coordinates. Elements are
+    larger inside and at the back of the cylinder. Raises ValueError if the spacing is too large for
+    the cylinder, or if the angles are invalid.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
@@ -176,8 +175,8 @@ def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> F
     """Return the x coordinates (s,), m, of the cross-sections, including both ends of the cylinder.
 
     If the sizes have a focus (a point near which the mesh is fine), one cross-section is at the
-    focus. Within `near_m` of the focus, the distances are equal. If x = 0 is a plane of symmetry,
-    only values x >= 0 are returned.
+    focus. Within the distance `near_m` of the focus, the spacing is uniform. If x = 0 is a plane of
+    symmetry, only values x >= 0 are returned.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -196,7 +195,8 @@ def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> F
 
 
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Return the angles (n,), in rad, of points on an arc from `start` to `stop` (excluded).
+    """Return the angles (n,), in rad, of points on an arc from `start` to `stop`. The end is
+    excluded.
 
     The distances between the points are the required element sizes. radius: radius of the arc, m.
     depth: depth (m) of the arc below the curved side.
@@ -211,8 +211,8 @@ def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floa
     """Return increasing values whose spacing is the reciprocal of a density.
 
     fine: increasing values that cover the range of the result. The result omits the end of the
-    range. density: required number of points per unit at each of these values. min_count: minimum
-    number of results.
+    range. density: required number of result values per unit, at each value of `fine`. min_count:
+    minimum number of result values.
     """
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
     pieces = max(min_count, round(float(total[-1])))
@@ -221,8 +221,9 @@ def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floa
 
 
 def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
-    """Yield the radius and the depth (m) of each ring of points, from the outermost ring to the
-    centre.
+    """Yield the radius (m) and the depth (m) of each ring of points in a cross-section.
+
+    The outermost ring comes first. The depth is the distance from the curved side.
     """
     depth, step = 0.0, sizes.element_m
     while True:
@@ -308,8 +309,8 @@ def _triangles(points: Floats, where: Floats) -> Ints:
     """Triangulate points, and return counter-clockwise triangles (t, 3) of point indices.
 
     points (n, 2): true positions. where (n, 2): positions from which the Delaunay triangulation
-    selects the connected points. These positions can differ from `points`. Triangles without area
-    are omitted.
+    selects the connected points. These positions can differ from `points`. Triangles whose area is
+    zero are omitted.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
@@ -325,10 +326,10 @@ def _triangles(points: Floats, where: Floats) -> Ints:
 def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[Floats, Ints]:
     """Extrude a cross-section, and return corner nodes (k, 3) and tetrahedra (e, 4).
 
-    points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the cross-sections, m. The
-    diagonals alternate between slices, so that the mesh has no preferred direction. swapped: index
-    of a slice whose ends are exchanged before it is divided. Starting with this slice, every second
-    slice is exchanged.
+    points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the s cross-sections, m.
+    The diagonals alternate between slices, so that the mesh has no preferred direction. swapped:
+    index of the first slice whose two ends are exchanged before it is divided. From there on, the
+    ends of every second slice are exchanged.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])

@@ -36,9 +36,10 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 from flexsheet.nodes.models.shapes import Shape
 
 INITIAL_CELL_RATIO = 2
-"""The width of the lattice cells before bisection, divided by the minimum element size."""
+"""The width of the lattice cells before they are bisected, divided by the minimum element size."""
 MIN_SIZE_RATIO = 0.5
-"""The minimum element size at sharp curvature, divided by the minimum element size elsewhere."""
+"""The minimum element size where the surface is sharply curved, divided by the minimum elsewhere.
+"""
 CURVATURE_SIZE_RATIO = 0.8
 """The maximum element size, divided by the radius of curvature of the surface."""
 SURFACE_DISTANCE_RATIO = 0.5
@@ -48,7 +49,7 @@ CORE_DEPTH_RATIO = 0.4
 """The minimum depth of a core (interior) vertex below the surface, divided by the length of the
 shortest edge at this vertex."""
 MAX_THINNED_FRACTION = 0.05
-"""The maximum fraction of core (interior) vertices that may be removed. If more are removed, the
+"""The maximum fraction of core (interior) vertices that are removed. If more must be removed, the
 object is too thin."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
@@ -58,7 +59,7 @@ best fit is used."""
 
 
 class _SurfaceCache:
-    """A cache of the distance, normal and curvature of the surface at lattice vertices."""
+    """A cache of the surface's distance, normal and curvature for each lattice vertex."""
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m
@@ -69,10 +70,10 @@ class _SurfaceCache:
         return self.origin + vertices * (self.cell_m / CELL)
 
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
-        """Return the signed distance (n,), m, the normal (n, 3) and the curvature (n,), 1/m, of the
-        surface.
+        """Return signed distances (n,), m, surface normals (n, 3) and surface curvatures (n,), 1/m.
 
-        The values belong to the surface points nearest to the lattice vertices (n, 3).
+        A signed distance is the distance of a lattice vertex from the surface. Normals and
+        curvatures are evaluated at the surface points nearest to the vertices.
         """
         keys = [vertex.tobytes() for vertex in vertices]
         new = [i for i, key in enumerate(keys) if key not in self._row_numbers]
@@ -137,8 +138,8 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
 def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
     """Limit element sizes (n,), m, to `CURVATURE_SIZE_RATIO` times the radius of curvature.
 
-    bend (n,): curvatures, 1/m. grading: required element sizes, which determine the lower bound of
-    the result.
+    bend (n,): surface curvature at each element, 1/m. grading: required element sizes, which
+    determine the lower bound of the result.
     """
     finest = np.maximum(
         CURVATURE_SIZE_RATIO / np.maximum(bend, 1e-9), MIN_SIZE_RATIO * grading.element_m
@@ -180,7 +181,7 @@ def _cover_with_lattice(
 
 
 def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return the length (n,) of the shortest edge at each of the n vertices."""
+    """Return the length (n,), m, of the shortest edge at each of the n vertices."""
     ends = tetrahedra[:, EDGES].reshape(-1, 2)
     length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     shortest = np.full(len(points), np.inf)

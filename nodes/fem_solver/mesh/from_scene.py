@@ -46,22 +46,25 @@ Vector = tuple[float, float, float]
 VERSION = 1
 """The version of the meshing code. Increase it when the mesh for the same specification changes."""
 TOUCH_MARGIN_RAD = 0.45
-"""The angle by which the touchable skin extends beyond the maximum tilt of the working range."""
+"""The angle by which the touchable skin extends beyond the maximum sheet tilt of the working range.
+"""
 SLAB_DEPTHS = 2.0
-"""The depth of the slab that represents a half-space, divided by the push depth of the scene."""
+"""The depth of the slab that represents a half-space, divided by the scene's maximum push depth."""
 MIN_THICKNESS_SPACINGS = 4.0
-"""The minimum thickness of the object, in skin spacings. It corresponds to two elements."""
+"""The minimum thickness of the object, in skin spacings. This thickness corresponds to two
+elements."""
 MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
-"""The maximum memory (bytes) per node during meshing, as measured."""
+"""The measured maximum memory (bytes) that meshing needs per node."""
 SAMPLES = 16
-"""The number of samples per side of the bounding box in the estimate of the number of nodes."""
+"""The number of samples along each side of the bounding box with which the number of nodes is
+estimated."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""The measured ratios of the number of nodes to its estimate, for a cylinder and for a mesh file.
-`INNER_FACTOR` and `SKIN_FACTOR` apply to inner nodes and skin nodes before these factors."""
+"""The measured ratio of the actual to the estimated number of nodes, for a cylinder and for a mesh
+file. `INNER_FACTOR` and `SKIN_FACTOR` apply to inner nodes and skin nodes before these factors."""
 MAX_LOST_FRACTION = 0.1
-"""The maximum fraction of an object's volume that its mesh may omit."""
+"""The maximum fraction of an object's volume that the mesh is allowed to omit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +73,9 @@ class MeshSpec:
 
     touch_angle_rad: maximum angle between the normal of touchable skin and the direction to the
     user. skin_spacing_m: distance between skin nodes. towards_user: unit vector to the user, mesh
-    frame. down: downward direction for a base support, object frame. rotation_rad: rotation of the
-    mesh frame of a cylinder about the object's x axis. slab_depth_m: depth of the slab that
-    represents a half-space.
+    frame. down: downward direction in the object frame, used if the support is a base.
+    rotation_rad: rotation of the mesh frame of a cylinder about the object's x axis. slab_depth_m:
+    depth of the slab that represents a half-space.
     """
 
     geometry: Geometry
@@ -300,7 +303,10 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 
 
 def _slab_normals(nodes: Floats) -> Floats:
-    """Return the normals (n, 3) at the top and bottom nodes of a slab, and +x at other nodes."""
+    """Return a unit vector (n, 3) for each node of a slab.
+
+    The vector is the outward normal at nodes of the top and the bottom, and +x at other nodes.
+    """
     normals = np.zeros_like(nodes)
     normals[:, 0] = 1.0
     low, high = nodes[:, 2].min(), nodes[:, 2].max()

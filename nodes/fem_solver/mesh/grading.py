@@ -11,7 +11,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
-"""The increase of the element size per depth below the skin (m/m)."""
+"""The increase of the element size (m) per metre of depth below the skin."""
 RAMP_RAD = 0.6
 """The angle beyond the touchable skin over which the element size increases."""
 EDGE_SIZE_RATIO = 1.1 * np.sqrt(2.0)
@@ -48,8 +48,8 @@ class Grading:
     def sizes(self, normals: Floats, depth_m: Floats) -> Floats:
         """Return the required element sizes (n,), m.
 
-        normals (n, 3): unit normals of the nearest skin. depth_m (n,): depths below the nearest
-        skin.
+        For each of the n elements, normals (n, 3) contains the unit normal of the nearest skin, and
+        depth_m (n,) contains the depth below this skin.
         """
         behind = np.clip((self._angles(normals) - self.touch_angle_rad) / RAMP_RAD, 0.0, 1.0)
         coarser = 1.0 + (BACK_COARSENING - 1.0) * behind

@@ -1,13 +1,13 @@
-"""Mesh sphere, ellipsoid, rounded box and slab by mapping the vertices of a bisected lattice.
+"""Mesh a sphere, ellipsoid, rounded box or slab by mapping the vertices of a bisected lattice.
 
 Let u be the coordinates of a lattice vertex, scaled so that the lattice is the cube [-1, 1]^3. With
 s = max |u_i|, the point w = u / s is on the surface of the cube. The vertex is mapped to
 
     x(u) = c u + s^2 (X(w) - c w)
 
-X maps the surface of the cube to the surface of the solid (`CuboidMap.surface`). c contains half
-extents (`CuboidMap.inner_m`). Near the centre, the lattice is only scaled by c. The meshes of
-symmetric solids are symmetric.
+X maps the surface of the cube to the surface of the solid (`CuboidMap.surface`). c contains the
+half extents of the undistorted inner lattice (`CuboidMap.inner_m`). Near the centre, the lattice is
+only scaled by c. The meshes of symmetric solids are symmetric.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 from flexsheet.nodes.models.shapes import CuboidMap, Shape
 
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
-"""The widths of the lattice cells before bisection that are tried, divided by the minimum element
-size."""
+"""The cell widths that are tried for the lattice before it is bisected, divided by the minimum
+element size."""
 ANCHORS = (30.0, 3.0, 0.3, 0.0)
-"""The stiffnesses of the springs that hold corners at their mapped positions. The
+"""The stiffnesses that are tried for the springs between corners and their mapped positions. The
 first value for which the radius ratios of all elements exceed `GOOD_RATIO` is used."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
@@ -130,10 +130,10 @@ def _map_lattices(
 ) -> list[tuple[Floats, Ints, Bools]]:
     """Return several mapped lattices, sorted by their number of elements.
 
-    The lattices start with cells of different sizes and are bisected where smaller elements are
-    required. A lattice consists of corners (n, 3), tetrahedra (e, 4), and flags (n,) for corners on
-    the boundary. half_m (3,): half extents. element_m: minimum element size. positions: function
-    that maps the vertices.
+    The lattices initially have cells of different sizes. They are bisected where smaller elements
+    are required. A lattice consists of corners (n, 3), tetrahedra (e, 4), and flags (n,) for
+    corners on the boundary. half_m (3,): half extents. element_m: minimum element size. positions:
+    function that maps the vertices.
     """
     found: list[tuple[Floats, Ints, Bools]] = []
     for cells in COARSENINGS:

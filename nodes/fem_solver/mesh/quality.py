@@ -12,11 +12,12 @@ MIN_RADIUS_RATIO = 0.1
 """The minimum radius ratio (3 times the inscribed radius over the circumscribed radius) of all
 elements of an accepted mesh."""
 MIN_JACOBIAN_RATIO = 0.1
-"""The minimum Jacobian determinant of a curved element, divided by that of the element with
-straight edges."""
+"""The minimum Jacobian determinant of a curved element, divided by the determinant of the same
+element with straight edges."""
 
 _EDGE_OF = np.array([[-1, 4, 6, 7], [4, -1, 5, 8], [6, 5, -1, 9], [7, 8, 9, -1]])
-"""The node index of the midpoint of the edge between two corners (row and column) of an element."""
+"""The index of the node at the midpoint of each edge of an element. The row and the column are the
+indices of the edge's two corners."""
 
 
 def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:

@@ -20,8 +20,8 @@ from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from flexsheet.nodes.models.shapes import Shape
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""The spring stiffness in each round, if the initial distance of the boundary from the surface is
-at most one element. The unit of length is the median edge length.
+"""The spring stiffness in each round, if the boundary is initially at most one element away from
+the surface. The unit of length is the median edge length.
 """
 SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
 """The spring stiffness in each round, if the boundary is initially on the surface."""
@@ -49,11 +49,11 @@ def smooth_mesh(
 ) -> Floats:
     """Improve the shape of tetrahedra, and return the new positions (n, 3), m, of their corners.
 
-    corners (n, 3), m, tetrahedra (e, 4): mesh with positive volumes. hull: indices of the corners
-    that move to the surface of `shape`. springs: spring stiffness in each round. anchor: stiffness
-    of springs from each corner to its initial position. These springs preserve the variation of
-    element sizes. If an element would have a radius ratio below `MIN_FINAL_RADIUS_RATIO`, its
-    corners are not moved fully onto the surface.
+    corners (n, 3): corner positions, m. tetrahedra (e, 4): corner indices, ordered for positive
+    volumes. hull: indices of the corners that move to the surface of `shape`. springs: spring
+    stiffness in each round. anchor: stiffness of springs from each corner to its initial position.
+    These springs preserve the variation of element sizes. If an element would have a radius ratio
+    below `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
@@ -113,9 +113,9 @@ def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
 def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
     """Minimize an energy by `ROUND_STEPS` steps of L-BFGS with a backtracking line search.
 
-    points (n, 3): start. energy: function that returns the energy and its gradient (n, 3). Unlike
-    the line search of SciPy, this line search accepts infinite energies. Source: Nocedal and
-    Wright, Numerical Optimization, alg. 7.5.
+    points (n, 3): initial positions. energy: function that returns the energy and its gradient (n,
+    3). Unlike the line search of SciPy, this line search accepts infinite energies. Source: Nocedal
+    and Wright, Numerical Optimization, alg. 7.5.
     """
     value, gradient = energy(points)
     steps: list[tuple[Floats, Floats, float]] = []

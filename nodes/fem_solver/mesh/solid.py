@@ -1,7 +1,8 @@
 """Define solid meshes of 10-node tetrahedra and the roles of their surface nodes.
 
-The nodes of an element are its corners, then the midpoints of its edges, in the order of VTK. The
-midpoints of edges on a curved surface are on the true surface. All other edges are straight.
+The nodes of an element are its four corners and then the midpoints of its six edges, in the order
+that VTK uses. The midpoints of edges on a curved surface are on the true surface. All other edges
+are straight.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ seen from outside, and then the midpoints of the edges between these corners."""
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """The division of a six-node triangle into four flat triangles over the same nodes."""
 SAME_M = 1e-9
-"""The maximum distance (m) from a plane at which a node counts as a point of this plane."""
+"""The maximum distance (m) from a plane at which a node counts as lying in the plane."""
 
 
 class UnfitMeshError(FlexsheetError, ValueError):
-    """Raised for an object that cannot be meshed as specified."""
+    """Raised if an object cannot be meshed as specified."""
 
     code = "unfit-mesh"
     remedy = "Choose a coarser or finer spacing, or repair the surface."
@@ -36,12 +37,12 @@ class UnfitMeshError(FlexsheetError, ValueError):
 class SolidMesh:
     """A solid mesh of 10-node tetrahedra.
 
-    nodes (n, 3): positions, m, mesh frame. elements (e, 10): node indices. fixed (n,): whether each
-    node is fixed. skin (s,): indices of the nodes on the surface. skin_triangles (t, 3): indices
-    into `skin`, ordered for outward normals. contact_nodes (m,): sorted indices of the nodes on the
-    skin that the finger can touch. contact_normals (m, 3): outward normals at these nodes.
-    contact_faces (f, 6): six-node triangles as indices into `contact_nodes`, ordered for outward
-    normals.
+    nodes (n, 3): positions of the n nodes, m, mesh frame. elements (e, 10): node indices. fixed
+    (n,): whether each node is fixed. skin (s,): indices of the nodes on the surface. skin_triangles
+    (t, 3): indices into `skin`, ordered for outward normals. contact_nodes (m,): sorted indices of
+    the nodes on the skin that the finger can touch. contact_normals (m, 3): outward normals at
+    these nodes. contact_faces (f, 6): six-node triangles as indices into `contact_nodes`, ordered
+    for outward normals.
     """
 
     nodes: Floats
@@ -89,10 +90,11 @@ def boundary_faces(elements: Ints) -> Ints:
 
 
 def nodes_in_planes(nodes: Floats, mirror_axes: tuple[int, ...]) -> Bools:
-    """Return whether each node is in each plane of symmetry through the origin, as an array (n, 3).
+    """Return whether each node is in each plane of symmetry, as an array (n, 3) with one column per
+    axis.
 
-    nodes (n, 3): positions, m. mirror_axes: axes of the planes. The other columns of the result are
-    false.
+    nodes (n, 3): positions, m. mirror_axes: axes that are perpendicular to the planes, 0 for x = 0
+    and 1 for y = 0. The columns of other axes are false.
     """
     inside: Bools = np.abs(nodes) < SAME_M
     inside[:, [axis for axis in range(3) if axis not in mirror_axes]] = False
@@ -102,7 +104,7 @@ def nodes_in_planes(nodes: Floats, mirror_axes: tuple[int, ...]) -> Bools:
 def skin_faces(nodes: Floats, elements: Ints, mirror_axes: tuple[int, ...]) -> Ints:
     """Return the boundary faces (f, 6) that are not in a plane of symmetry.
 
-    mirror_axes: axes of the planes, 0 for x = 0 and 1 for y = 0.
+    mirror_axes: axes that are perpendicular to these planes, 0 for x = 0 and 1 for y = 0.
     """
     faces = boundary_faces(elements)
     in_planes = np.any(np.all(nodes_in_planes(nodes, mirror_axes)[faces], axis=1), axis=1)
@@ -122,7 +124,7 @@ def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
 
 
 def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
-    """Return the tetrahedra (e, 4), reordered so that all volumes are positive."""
+    """Return the tetrahedra (e, 4) with corners in an order that makes all volumes positive."""
     sides = corners[tetrahedra[:, 1:]] - corners[tetrahedra[:, :1]]
     oriented = tetrahedra.copy()
     oriented[:, 1:3] = np.where(
@@ -190,7 +192,7 @@ def make_solid_mesh(
 
 
 def restrict_touchable(mesh: SolidMesh, touchable: Bools) -> SolidMesh:
-    """Return a copy of the mesh that has fewer touchable nodes.
+    """Return a copy of the mesh in which fewer nodes are touchable.
 
     touchable (n,): whether each node may remain touchable. Fixed nodes are always excluded. Raises
     UnfitMeshError if no touchable face remains.

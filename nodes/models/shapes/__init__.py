@@ -1,4 +1,4 @@
-"""Provide the shapes of virtual objects. The class `surface.Shape` is their common interface."""
+"""Provide the shapes of virtual objects. All shapes implement the interface `surface.Shape`."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def make_shape(geometry: Mapping[str, Any]) -> Shape:
     geometry: the key `shape` is the name of the shape, the key `origin` is ignored, and the other
         keys are the dimensions.
 
-    Raises KeyError for an unknown name, and ValueError (for meshes its subclass MeshError) for
-    invalid dimensions.
+    Raises KeyError if the name is unknown, and ValueError if a dimension is invalid. For an invalid
+    mesh, the error is MeshError, a subclass of ValueError.
     """
     dimensions = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
     return GEOMETRIES[geometry["shape"]].make_shape(**dimensions)

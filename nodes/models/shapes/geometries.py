@@ -1,8 +1,8 @@
 """Describe each kind of geometry in one table, `GEOMETRIES`.
 
-The functions in a description receive the dimensions of a geometry as an object with attributes,
-such as `scene.object.geometry` or the shape itself. A new kind of geometry needs a shape class and
-a description in the table.
+The functions in a description receive an object whose attributes are the dimensions of the
+geometry. Examples are `scene.object.geometry` and the shape itself. A new kind of geometry needs a
+shape class and a description in the table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from flexsheet.nodes.models.shapes.solids import (
 from flexsheet.nodes.models.shapes.surface import Shape
 
 INNER_RATIO = 0.8
-"""The size of the undistorted inner lattice in a round solid's mesh, divided by the solid's size.
+"""The size of the undistorted inner lattice in the mesh of a round solid, divided by the size of
+the solid.
 """
 
 
@@ -52,11 +53,11 @@ class GeometryDescription:
     make_shape: function that makes the shape; the dimensions are its keyword arguments.
     bounds_m: function that returns the lower and upper corner (3,) of the bounding box of the
         solid. For a half-space, the box contains only the touchable rectangle.
-    extent_m: function that returns the extent of the touchable surface from the origin along a unit
-        vector, m.
-    scale: function that returns the dimensions of the geometry after scaling by a ratio.
-    cuboid_map: function that returns the map for meshing, given dimensions and shape; None if the
-        shape is meshed by another method.
+    extent_m: function that returns how far (m) the touchable surface extends from the origin along
+        a unit vector.
+    scale: function that returns the dimensions multiplied by a ratio.
+    cuboid_map: function that returns the map for meshing; None if the shape is meshed by another
+        method. The arguments are the dimensions and the shape.
     """
 
     make_shape: Callable[..., Shape]
@@ -100,7 +101,9 @@ def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
 
 
 def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
-    """Return the extent (m) of a cylinder's lateral surface from the origin along a unit vector."""
+    """Return how far (m) the lateral surface of a cylinder extends from the origin along a unit
+    vector.
+    """
     return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
 
 

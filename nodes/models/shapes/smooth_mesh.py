@@ -1,7 +1,7 @@
 """Represent a closed triangle mesh as a smooth implicit surface.
 
-A sheet that is tangent to flat facets would change its orientation abruptly. Therefore the surface
-is smoothed over the smoothing length `rho` (m), in two steps:
+A sheet that follows the flat facets of a mesh would change its orientation abruptly. Therefore the
+surface is smoothed over the smoothing length `rho` (m), in two steps:
 
 1. Local quadratic fits, called jets (Cazals and Pouget, Estimating Differential Quantities Using
     Polynomial Fitting of Osculating Jets, 2005): a quadratic is fitted by least squares around
@@ -14,9 +14,9 @@ is smoothed over the smoothing length `rho` (m), in two steps:
     1, in which its weight is not zero.
 
 f is three times continuously differentiable, so the normal has a continuous second derivative along
-a path. Supports are half as thick along the normal as across it, so the two sides of a thin part do
-not affect each other. Edges sharper than `rho` are rounded over about that length. `deviation_m` is
-the resulting maximum distance between surface and mesh.
+a path. The supports are flat: half as thick along the normal as wide across it. Therefore the two
+sides of a thin part do not affect each other. Edges sharper than `rho` are rounded over about that
+length. `deviation_m` is the resulting maximum distance between surface and mesh.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ from flexsheet.nodes.models.shapes.triangles import (
 FLATNESS = 3.0
 """The flatness of the support (region of influence) of a jet, which is a local quadratic fit.
 
-The ratio of the support's extents along the jet's normal and across it is 1 / sqrt(1 + FLATNESS).
+The thickness of the support along the jet's normal, divided by its width across the normal, is 1 /
+sqrt(1 + FLATNESS).
 """
 FIT_RATIO = 1.25
 """The radius of the neighbourhood in which vertices are used for a local quadratic fit, divided by
@@ -59,8 +60,8 @@ SPACING_RATIO = 1.0 / 3.0
 """The minimum distance between jets (local quadratic fits) on the same side of the surface, divided
 by the smoothing length `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""The minimum cosine of the angle between two normals: of a local quadratic fit (jet), and of a
-vertex that is used for the fit."""
+"""The minimum cosine of the angle between two normals. One is the normal of a local quadratic fit
+(jet), and the other is the normal of a vertex in the fit."""
 MAX_CURVATURE_RATIO = 2.0
 """The maximum product of the curvature (1/m) of a local quadratic fit (jet) and the smoothing
 length `rho` (m)."""
@@ -68,44 +69,48 @@ EDGE = 1.5
 """The curvature above which a surface point counts as an edge, divided by the maximum curvature of
 a local quadratic fit (jet)."""
 OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
-"""The limits of | |grad f| - 1 | for the level set f. The value is 0 where adjacent local quadratic
-fits (jets) agree.
+"""Two limits of | |grad f| - 1 |, where f is the level set. This deviation is 0 where adjacent
+local quadratic fits (jets) agree.
 
-Above the first limit, a surface point counts as an edge, where jets with different normals meet.
-Above the second limit, a point with f = 0 does not represent the mesh. Such points occur beyond the
-rim of a thin part.
+If the deviation exceeds the first limit, a surface point counts as an edge, where jets with
+different normals meet. If it exceeds the second limit, a point with f = 0 does not represent the
+mesh. Such points occur beyond the rim of a thin part.
 """
 MIN_SUPPORT = 0.1
-"""The minimum sum of the jets' weights w_i on the surface. The sum is smaller only beyond the rim
-of a thin part."""
+"""The minimum sum of the weights of local quadratic fits (jets) at a surface point. The sum is
+smaller only beyond the rim of a thin part."""
 MEMBERS_KNOWN = 0.1
-"""The distance, divided by `rho`, by which a point moves before its list of nearby local quadratic
-fits (jets) is updated."""
+"""The distance by which a point moves before its list of nearby local quadratic fits (jets) is
+updated, divided by the smoothing length `rho`."""
 STRIDE_RATIO = 0.4
-"""The maximum step of the projection onto the surface, divided by `rho`.
+"""The maximum step of the projection onto the surface, divided by the smoothing length `rho`.
 
 Longer steps could leave the region in which the surface is defined.
 """
 REST_RATIO = 1e-3
-"""The step of the projection, divided by `rho`, below which the projection counts as converged.
+"""The step below which the projection onto the surface has converged, divided by the smoothing
+length `rho`.
 
-The remaining error is some nanometres in position and about 1e-5 rad in the normal.
+The remaining error is a few nanometres in the position and about 1e-5 rad in the normal.
 """
 APART_RATIO = 0.4
-"""The distance above which two surface points count as distinct, divided by `rho`."""
+"""The distance above which two surface points count as distinct, divided by the smoothing length
+`rho`."""
 MAX_DEVIATION_RATIO = 0.22
-"""The maximum permitted distance between the smooth surface and the mesh, divided by `rho`."""
+"""The maximum permitted distance between the smooth surface and the mesh, divided by the smoothing
+length `rho`."""
 MAX_EXTENT_FRACTION = 1.0 / 3.0
 MAX_STARTS = 6
 """The maximum number of additional starting points in the search for the global nearest point."""
 MIN_CURVATURE_FACTOR = 0.1
-"""The lower bound on the eigenvalues of I + h A (h: height above a surface point, A: shape
-operator).
+"""The lower bound on the eigenvalues of I + h A. h is the height above a surface point, and A is
+the shape operator.
 
 An eigenvalue is 0 at a centre of curvature.
 """
 RIM_FRACTION = 0.8
-"""The fraction of the maximum distance beyond which `rise_m` reduces the weight of heights."""
+"""The distance beyond which `rise_m` reduces the weight of heights, as a fraction of the maximum
+distance `radius_m`."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -119,8 +124,8 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
     vertices (v, 3): positions, m.
     triangles (t, 3): indices of vertices.
 
-    If the length were shorter, users would feel the facets. If it were longer, curved parts would
-    be flattened.
+    If the smoothing length were shorter, users would feel the facets. If it were longer, curved
+    parts would be flattened.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
@@ -133,7 +138,7 @@ class SmoothMeshShape:
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
 
-        vertices_m (v, 3), triangles (t, 3): mesh.
+        vertices_m (v, 3): vertices of the mesh, m. triangles (t, 3): vertex indices.
         smoothing_m: smoothing length, m.
 
         Raises MeshError if the mesh does not bound a solid, or is too small for the smoothing
@@ -222,7 +227,7 @@ class SmoothMeshShape:
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """Find the nearest surface point of a query (3,), starting from the previous nearest point
+        """Find the surface point nearest to a query (3,), starting from the previous nearest point
         `before` (3,).
 
         Return None if the projection does not converge.
@@ -242,7 +247,8 @@ class SmoothMeshShape:
         )
 
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
-        """Return the nearest surface points of queries (n, 3), and whether they are ambiguous (n,).
+        """Return the surface points nearest to queries (n, 3), and whether each point is ambiguous
+        (n,).
 
         before: nearest points (n, 3) of the previous queries, or None if there are none.
         """
@@ -257,11 +263,11 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _find_global_nearest(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """Return the globally nearest surface points of queries (n, 3), and whether they are
-        ambiguous (n,).
+        """Return the surface points that are globally nearest to queries (n, 3), and whether each
+        point is ambiguous (n,).
 
-        A jet is a local quadratic fit of the surface. Each query is first projected from its
-        nearest jet, which gives a point at a distance D. Each point of the surface has a jet within
+        A jet is a local quadratic fit of the surface. The projection of each query starts at the
+        nearest jet, and gives a point at a distance D. Each point of the surface has a jet within
         the distance c (`_cover`). The radius of curvature is at least rho (`smoothing_m`).
         Therefore the jet of a nearer point is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the
         query. Further projections start from selected jets within this distance.
@@ -303,12 +309,13 @@ class SmoothMeshShape:
         """Choose further starting points for the search for a nearer surface point.
 
         lists: indices of the candidate jets (local quadratic fits) of each query.
-        feet (n, 3), distance (n,): nearest surface points found before, and their distances from
-            the queries, in m.
+        feet (n, 3): nearest surface points that were found before, m. distance (n,): distances of
+            these points from the queries, m.
 
-        Return k pairs: indices of the queries (k,) and of the jets (k,) at which to start. A jet is
-        chosen if the nearest point on its quadratic is close to the jet and not much farther than
-        `distance`. Jets within `rho` of `feet` or of a chosen jet are omitted.
+        Return the starting points as k pairs of a query and a jet: query indices (k,) and jet
+        indices (k,). A jet is chosen if the nearest point on its quadratic is close to the jet and
+        not much farther than `distance`. A jet is omitted if its distance from `feet` or from a
+        chosen jet is below the smoothing length.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -371,7 +378,7 @@ class SmoothMeshShape:
         return float((height[within] * np.minimum(weight, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
-        """Return the approximate nearest points (n, 3) of queries (n, 3) on the jets (n,).
+        """Return points (n, 3) on jets that are approximately nearest to queries (n, 3).
 
         jet (n,): index of the jet (local quadratic fit) for each query.
         """
@@ -388,13 +395,13 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """List, for each jet (local quadratic fit), the jets whose weights are not zero in its
-        neighbourhood.
+        """List the jets (local quadratic fits) that have weight in the neighbourhood of each jet.
 
         cover (j,): radius (m) of the neighbourhood of each jet.
 
         Return a table (j, k) of jet indices, and the number (j,) of valid entries in each row. Rows
-        are padded with the index of an additional jet without influence, which this method appends.
+        are padded with the index of an additional jet that has no influence. This method appends
+        that jet.
         """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
@@ -410,8 +417,8 @@ class SmoothMeshShape:
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Evaluate f at points (n, 3) near the surface. This implements a `LevelSet`.
 
-        Return the values of f (n,), gradients (n, 3), Hessians (n, 3, 3) and sums of the weights
-        w_i (n,).
+        Return the values (n,), gradients (n, 3) and Hessians (n, 3, 3) of f, and the sums (n,) of
+        the jets' weights.
         """
         nearest = self._tree.query(points)[1]
         members = self._table[nearest, : self._counts[nearest].max()]
@@ -454,8 +461,8 @@ class SmoothMeshShape:
         """Return the index of the jet (local quadratic fit) nearest to a point (3,), and nearby
         jets.
 
-        The k jets whose weights are not zero near the point are given by indices (k,), centres (k,
-        3), normals (k, 3) and shape operators (k, 3, 3).
+        The nearby jets are the k jets that have weight near the point. They are returned as indices
+        (k,), centres (k, 3), normals (k, 3) and shape operators (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -469,7 +476,8 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """A function that evaluates the level set f of a mesh for the projection of one query.
+    """A function object that evaluates the level set f of a mesh during the projection of one
+    query.
 
     To save time, the list of nearby jets is updated only when the point has moved by
     `MEMBERS_KNOWN` times `rho`.
@@ -515,7 +523,7 @@ class _LevelNear:
 
 
 def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
-    """Clear `is_nearest` for projections that ended beyond the rim of a thin part.
+    """Set `is_nearest` to false for projections that ended beyond the rim of a thin part.
 
     Beyond a rim, the points with f = 0 do not represent the surface of the mesh.
     """
@@ -530,7 +538,7 @@ def _put(
     other: SurfaceProjections,
     chosen: Bools | slice = slice(None),
 ) -> None:
-    """Replace rows of `feet` by rows of `other`, in place.
+    """Replace rows of the array fields of `feet` by rows of `other`, in place.
 
     rows: indices of the replaced rows.
     chosen: mask or slice that selects the rows of `other`.
@@ -566,7 +574,7 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
 
 
 def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
-    """Select vertices that are at least `spacing` (m) apart on each side of the surface; return
+    """Select vertices that are at least `spacing` (m) apart on each side of a thin part, and return
     their indices.
 
     Every vertex that is not selected has a selected vertex within `spacing` on the same side.
@@ -599,7 +607,7 @@ def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
 def _jet(
     origin: Floats, rough: Floats, around: Floats, rho: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Fit a quadratic z(x, y) to the points `around` (m, 3) by weighted least squares.
+    """Fit a quadratic z(x, y) to m points `around` (m, 3) by weighted least squares.
 
     origin, rough (3,): vertex, and approximate normal at this vertex, which defines the z axis.
 

@@ -1,4 +1,5 @@
-"""Define the virtual objects with simple formulas: cylinder, sphere, plane, ellipsoid and box.
+"""Define the virtual objects that simple formulas describe: cylinder, sphere, plane, ellipsoid and
+box.
 
 Each class implements the interface `Shape` of the module `surface`.
 """
@@ -85,7 +86,7 @@ class SphereShape(Convex):
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
-        The nearest point is ambiguous at the centre.
+        The nearest point is ambiguous for the centre.
         """
         queries = check_points(points)
         normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
@@ -100,7 +101,9 @@ class SphereShape(Convex):
 
 @dataclass(frozen=True, slots=True)
 class PlaneShape(Convex):
-    """A half-space z <= 0 that can be touched on a rectangle of its face, centred on the origin."""
+    """The half-space z <= 0, whose face can be touched on a rectangle that is centred on the
+    origin.
+    """
 
     width_m: float
     height_m: float
@@ -144,7 +147,8 @@ class EllipsoidShape(Convex):
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
-        The nearest point is ambiguous in a part of the plane perpendicular to the shortest axis.
+        The nearest point is ambiguous for some points in the central plane perpendicular to the
+        shortest axis.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
@@ -184,7 +188,9 @@ class EllipsoidShape(Convex):
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate a quadratic function that is zero on the ellipsoid, as a `LevelSet`."""
+        """Evaluate a quadratic function that is zero on the ellipsoid. This implements a
+        `LevelSet`.
+        """
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
@@ -194,8 +200,8 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate the function of `_level` at a single point with Python numbers, as a
-        `LevelAt`.
+        """Evaluate the function of `_level` at a single point with Python numbers. This implements
+        a `LevelAt`.
         """
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
@@ -205,9 +211,9 @@ class EllipsoidShape(Convex):
     def _undecided(self, queries: Floats) -> Bools:
         """Return whether each query (n, 3) has several equally near surface points.
 
-        Such queries are in the plane through the centre, perpendicular to the shortest axis. There
-        they are inside the ellipse whose vertices are the centres of curvature at the ends of the
-        other axes.
+        Such queries are in the plane through the centre, perpendicular to the shortest axis. In
+        this plane, they are inside the ellipse whose vertices are the centres of curvature at the
+        ends of the other axes.
         """
         axes = np.array(self.semi_axes_m)
         shortest = np.flatnonzero(axes <= axes.min() * (1.0 + 1e-9))
@@ -218,15 +224,15 @@ class EllipsoidShape(Convex):
         return np.asarray(on_plane & inside)
 
     def _nearest(self, queries: Floats, sides: Floats) -> Floats:
-        """Return the globally nearest surface points (n, 3) of queries (n, 3).
+        """Return the surface points (n, 3) that are globally nearest to queries (n, 3).
 
-        With the semi-axes e_i, the nearest point to a query q is x_i = e_i^2 q_i / (t + e_i^2). t
-        is the largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to
-        an Ellipsoid, 2013). Newton's method is applied to the reciprocal of the square root of this
-        sum. This function is concave in t, so the method converges monotonically (Conn, Gould,
-        Toint, Trust-Region Methods, sec. 7.3). On a plane of symmetry, the terms have poles.
-        Therefore queries on such a plane are moved by a billionth of the shortest axis in the
-        directions `sides` (n, 3).
+        Let e_i be the semi-axes. The point nearest to a query q is x_i = e_i^2 q_i / (t + e_i^2),
+        where t is the largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a
+        Point to an Ellipsoid, 2013). Newton's method is applied to the reciprocal of the square
+        root of this sum. This function is concave in t, so the method converges monotonically
+        (Conn, Gould, Toint, Trust-Region Methods, sec. 7.3). On a plane of symmetry, the terms have
+        poles. Therefore queries on such a plane are moved by a billionth of the shortest axis in
+        the directions `sides` (n, 3).
         """
         axes = np.array(self.semi_axes_m)
         nudge = 1e-9 * axes.min()
@@ -276,7 +282,7 @@ class RoundedBoxShape(Convex):
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
-        The nearest point is ambiguous inside the box where two faces are equally near.
+        The nearest point is ambiguous for points inside the box that are equally near to two faces.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
@@ -313,17 +319,20 @@ class RoundedBoxShape(Convex):
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,), m, of the box without its rounding (the core)."""
+        """Return the half extents (3,), m, of the core. The core is the box between the centres of
+        curvature of the rounded edges.
+        """
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Return the face of the core that is nearest to each query (n, 3) inside the core.
+        """Return the face of the core that is nearest to each query (n, 3) inside the core. The
+        core is the box between the centres of curvature of the rounded edges.
 
-        before: previous nearest points (n, 3), or None if there are none. Only faces at these
-            points are considered. If there are no previous points, the first of equally near faces
-            in the order z, y, x, -z, -y, -x is chosen.
+        before: previous nearest points (n, 3), or None if there are none. Only faces that contain
+            these points are considered. If there are none and several faces are equally near, the
+            first face in the order z, y, x, -z, -y, -x is chosen.
 
         Return the axis (n,) and the sign (n,) of the face's normal, the distance from the face
         (n,), m, and whether the choice is ambiguous (n,).
@@ -355,9 +364,9 @@ def _directions(
 ) -> tuple[Floats, Floats, Bools]:
     """Return unit directions and lengths of offsets (..., 3), and whether each offset is zero.
 
-    across: indices of the coordinates in which the offsets may differ from zero. If an offset is
-        zero, the direction from the origin to the previous point is returned, or `FRONT` if there
-        is no previous point.
+    across: indices of the coordinates in which the offsets can differ from zero. If an offset is
+        zero, its direction is the direction from the origin to the previous point, or `FRONT` if
+        there is no previous point.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)

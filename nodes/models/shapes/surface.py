@@ -1,11 +1,11 @@
 """Define the interface of shapes, which return nearest surface points with normals and curvatures.
 
 Points are arrays (3,) or (n, 3), in m, in the frame of the object. Results have the same leading
-shape. A query is a point whose nearest surface point is searched. Normals point out of the object.
-The curvature is given as the shape operator W, a symmetric matrix (3, 3). For a small displacement
-dp along the surface, the unit normal n changes by dn = W dp, and W n = 0. The two other eigenvalues
-of W are the principal curvatures, positive where the object is convex (do Carmo, Differential
-Geometry of Curves and Surfaces, ch. 3).
+shape. A query is a point for which the nearest surface point is searched. Normals point out of the
+object. The shape operator W, a symmetric matrix (3, 3), describes the curvature. For a small
+displacement dp along the surface, the unit normal n changes by dn = W dp. In addition, W n = 0. The
+two other eigenvalues of W are the principal curvatures, positive where the object is convex (do
+Carmo, Differential Geometry of Curves and Surfaces, ch. 3).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MAX_QUERY_M = 1e6
 """The maximum absolute coordinate of a query."""
 
 FRONT = np.array([0.0, 0.0, 1.0])
-"""The direction in which the nearest point is chosen if several surface points are equally near.
+"""The direction that selects the nearest point if several surface points are equally near.
 
 This direction is used if there is no previous point. If the object is not rotated, the direction
 points to the user.
@@ -38,9 +38,10 @@ points to the user.
 class Nearest:
     """The touchable surface points that are nearest to queries.
 
-    point, normal: nearest point, m, and unit normal at this point (..., 3).
-    height_m: height (...) of the query above the tangent plane at `point`, negative below it. The
-        height equals the signed distance, except past an end of the surface.
+    point (..., 3), normal (..., 3): nearest point, m, and unit normal at this point.
+    height_m: height (...) of the query above the tangent plane at `point`, negative below this
+        plane. The height equals the signed distance, unless the query is beyond the rim of the
+        surface.
     shape_operator: shape operator (..., 3, 3) at `point`, 1/m.
     on_edge: whether `point` is on an edge of a mesh, or whether the query is beyond the rim of the
         touchable surface. A sheet can touch such a point but cannot roll over it.
@@ -56,7 +57,7 @@ class Nearest:
     undecided: Bools
 
     def reshape(self, shape: tuple[int, ...]) -> Nearest:
-        """Return a copy of flat results (n, ...) for queries of a shape (3,) or (n, 3)."""
+        """Return a copy of the results whose arrays match queries of the shape (3,) or (n, 3)."""
         return Nearest(
             self.point.reshape(shape),
             self.normal.reshape(shape),
@@ -73,31 +74,33 @@ class Shape(Protocol):
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Find the touchable surface points that are nearest to `points`.
 
-        previous: nearest points of the previous queries, with the shape of `points`; None for a new
-            contact. The results are then continuous over time: the search returns the local minimum
-            of the distance that continues the previous point, as long as this minimum exists.
-            Another point may be equally near, or nearer inside the object.
+        previous: nearest points of the previous queries, with the shape of `points`; None if the
+            contact is new. If previous points are given, the results are continuous over time. The
+            search then returns the local minimum of the distance that continues the previous point,
+            as long as this minimum exists. Another surface point can be equally near. Inside the
+            object, another point can even be nearer.
 
-        Raises ValueError if points are not finite, have a shape other than (3,) or (n, 3), or are
-        beyond `MAX_QUERY_M`.
+        Raises ValueError if a coordinate is not finite or exceeds `MAX_QUERY_M`, or if the shape of
+        the array is neither (3,) nor (n, 3).
         """
         ...
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """Return the signed distances (m) of points to the solid, which are negative inside.
 
-        Raises ValueError for points that `closest` does not accept.
+        Raises ValueError if `closest` does not accept the points.
         """
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return the maximum height (m) of the object above its tangent plane at a point (3,).
+        """Return the maximum height (m) of the object above its tangent plane at a surface point
+        (3,).
 
         normal (3,): unit normal at the point.
         radius_m: maximum considered distance from the point, measured along the plane.
 
-        The result is 0 where the object is not concave. Heights near the limit of the radius are
-        reduced, so that the result changes continuously with the point.
+        The result is 0 if the object is not concave near the point. Heights near the limit of the
+        radius are reduced, so that the result changes continuously with the point.
         """
         ...
 
@@ -150,7 +153,7 @@ def projection_jacobian(found: Nearest) -> Floats:
 
 
 def check_points(points: ArrayLike, name: str = "points") -> Floats:
-    """Convert points to a float array (3,) or (n, 3). Raises ValueError for invalid points.
+    """Convert points to a float array (3,) or (n, 3). Raises ValueError if the points are invalid.
 
     name: name of the argument in error texts.
     """
@@ -196,11 +199,12 @@ support is a measure of the validity of f at a point, and is 0 far away from the
 
 @dataclass(frozen=True, slots=True)
 class SurfaceProjections:
-    """The results of projecting n queries onto a surface.
+    """The results of the projection of n queries onto a surface.
 
     point, normal (n, 3): surface points, m, and unit normals.
     shape_operator (n, 3, 3): shape operators, 1/m.
-    steepness, support (n,): length of the gradient of the `LevelSet`, and its support.
+    steepness (n,): length of the gradient of the `LevelSet`.
+    support (n,): support of the `LevelSet` at each point.
     is_nearest (n,): whether the projection converged to a local minimum of the distance.
     """
 
@@ -217,7 +221,7 @@ MIN_EIGENVALUE = 0.02
 """The lower bound on the absolute eigenvalues of the reduced Hessian in the search for nearest
 points.
 
-The eigenvalues are 1 on a flat surface, and approach 0 near a centre of curvature, where a Newton
+The eigenvalues are 1 on a flat surface. Near a centre of curvature, they approach 0, and a Newton
 step would be too long. Beyond this centre, they are negative.
 """
 
@@ -233,8 +237,8 @@ def descend(
     Newton's method minimises |x - q|^2 for each query q on the surface f(x) = 0 (Nocedal and
     Wright, Numerical Optimization, ch. 18). A step has a part along the gradient, towards the
     surface, and a part along the surface. The second part solves the reduced system with the
-    Hessian of the Lagrangian, I + lambda H (H: Hessian of f, lambda: multiplier). The eigenvalues
-    of this Hessian are made positive, so that each step reduces the distance.
+    Hessian I + lambda H of the Lagrangian. H is the Hessian of f, and lambda is the multiplier. The
+    eigenvalues of this Hessian are made positive, so that each step reduces the distance.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)
@@ -287,7 +291,7 @@ LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[flo
 def descend_one(
     level: LevelAt, query: Floats, start: Floats, *, stride_m: float, rest_m: float
 ) -> SurfaceProjections:
-    """Project one query (3,) by the method of `descend`. The results have length one.
+    """Project one query (3,) by the method of `descend`. The result arrays have the length one.
 
     The computation with Python numbers is faster than operations on small arrays.
     """

@@ -19,14 +19,15 @@ Indices32 = NDArray[np.int32]
 
 MAX_TRIANGLES = 100_000
 MIN_HEIGHT_RATIO = 1e-6
-"""The ratio of height to longest edge below which a triangle counts as degenerate."""
+"""The minimum ratio of a triangle's height to its longest edge. Flatter triangles count as
+degenerate."""
 MAX_DIHEDRAL_RAD = np.radians(175.0)
 """The angle (rad) between the normals of adjacent triangles above which the mesh counts as folded.
 """
 
 
 class MeshError(FlexsheetError, ValueError):
-    """Raised for a mesh that is not the surface of a solid."""
+    """Raised if a mesh is not the surface of a solid."""
 
     code = "mesh"
     remedy = (
@@ -40,10 +41,10 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
     vertices (v, 3): positions, m.
     triangles (t, 3): indices of vertices.
 
-    The check covers array shapes, size, vertex indices, degenerate and repeated triangles, holes,
-    edges of more than two triangles, inconsistent winding, parts that share a single vertex, folded
-    neighbours, and wrong orientation. Intersections of triangles are not checked; see
-    `count_intersections`.
+    The check covers array shapes, size and vertex indices. It finds degenerate and repeated
+    triangles, holes, edges of more than two triangles, and parts that share only a single vertex.
+    It also finds inconsistent winding, folds and wrong orientation. Intersections of triangles are
+    not checked; see `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(
@@ -85,9 +86,11 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
 
 
 def triangulate_grid(rows: int, columns: int) -> Indices32:
-    """Return triangles (t, 3) that connect a grid of points, which are numbered row by row.
+    """Return triangles (t, 3) that connect the points of a grid. The points are numbered row by
+    row.
 
-    The triangles are counter-clockwise if columns are along +x and rows along +y.
+    The triangles are counter-clockwise if the column number increases along +x and the row number
+    along +y.
     """
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     right, above = corner + 1, corner + columns
@@ -113,7 +116,7 @@ def half_edges(triangles: Indices) -> Indices:
 
 
 def _check_edges(triangles: Indices) -> None:
-    """Raise MeshError unless every edge belongs to two triangles, which use it in opposite
+    """Raise MeshError unless every edge belongs to two triangles that contain the edge in opposite
     directions.
     """
     run = half_edges(triangles)
@@ -194,7 +197,7 @@ def unify_winding(triangles: Indices) -> Indices:
 
 
 def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
-    """Return the two half-edges (directed edges) of each edge, as two arrays (e,).
+    """Return the two half-edges (directed edges) of each of e edges, as two arrays (e,).
 
     The arrays contain row indices of the result of `half_edges`.
     """
@@ -253,8 +256,7 @@ def volume_m3(vertices: Floats, triangles: Indices) -> float:
 
 
 def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
-    """Divide triangles (t, 3) until no edge is longer than `longest_m`; return the new vertices and
-    triangles.
+    """Divide triangles (t, 3) until no edge is longer than `longest_m`, and return the new mesh.
 
     A long edge is halved in both adjacent triangles, so a closed mesh remains closed. Raises
     MeshError if the result has more than `MAX_TRIANGLES` triangles.
@@ -311,8 +313,8 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that intersect.
 
     A pair intersects if an edge of one triangle passes through the interior of the other triangle.
-    An edge is not considered if one of its ends is a vertex of the other triangle. Triangles that
-    only touch, or overlap in one plane, are not counted.
+    An edge is not considered if one of its ends is a vertex of the other triangle. Two triangles
+    are not counted if they only touch, or if they overlap in the same plane.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -337,7 +339,7 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
     """Yield the pairs of overlapping spheres in batches, as two arrays of sphere indices.
 
-    centre (n, 3), radius (n,): spheres, m.
+    centre (n, 3), radius (n,): centres and radii of the spheres, m.
 
     Spheres of similar size are searched together, because the largest sphere determines the search
     radius.
@@ -361,7 +363,8 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return whether each segment passes through the interior of its triangle, as an array (n,).
+    """Return whether each of n line segments passes through the interior of its triangle, as an
+    array (n,).
 
     start, end (n, 3): end points of the segments.
     corners (n, 3, 3): one triangle for each segment.
@@ -391,7 +394,7 @@ def intersect_rays(
 
     origin (3,): common point of the lines.
     rays (n, 3): directions.
-    corners (m, 3, 3): triangles.
+    corners (m, 3, 3): corners of m triangles.
 
     Return the index (n,) of the triangle that each line intersects, and the barycentric weights (n,
     3) of its corners. The weights are NaN if the line misses all triangles. Source: Möller and
@@ -415,11 +418,11 @@ def intersect_rays(
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Return the points of triangles that are nearest to `points` (n, 3).
+    """Return the points of n triangles that are nearest to `points` (n, 3).
 
-    corners (n, 3, 3): one triangle for each point.
+    corners (n, 3, 3): corners of one triangle for each point.
 
-    The result contains the barycentric coordinates (n, 3) of the nearest points.
+    The results (n, 3) are barycentric coordinates.
 
     Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
     """

@@ -1,8 +1,8 @@
-"""Provide models of the rubber sheet: poses of its edges, shape and forces.
+"""Provide models of the rubber sheet: the poses of the sheet's edges, the shape and the forces.
 
 The sheet frame has its origin at the centre. The x axis points from the left to the right clamped
-edge, y points along the edges, and z points towards the user. The functions compute the poses of
-the sheet, the edges and the arms' flanges from each other.
+edge, y points along the edges, and z points towards the user. The functions convert between the
+poses of the sheet, of its edges and of the arms' flanges.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from flexsheet.nodes.models.rigid import inverse, transform
 
 
 def edge_poses(world_from_sheet: Floats, edge_distance_m: float) -> tuple[Floats, Floats]:
-    """Return the poses world_from_edge (4, 4) of the left and right edge of a flat sheet."""
+    """Return the pose world_from_edge (4, 4) of the left and of the right edge of a flat sheet."""
     offset = 0.5 * edge_distance_m * world_from_sheet[:3, 0]
     rotation, centre = world_from_sheet[:3, :3], world_from_sheet[:3, 3]
     return transform(rotation, centre - offset), transform(rotation, centre + offset)
@@ -23,9 +23,9 @@ def edge_poses(world_from_sheet: Floats, edge_distance_m: float) -> tuple[Floats
 def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats) -> Floats:
     """Return the pose world_from_sheet (4, 4) of the sheet between two edges.
 
-    The edges need not be parallel. The origin is midway, and x points from left to right. The y
-    axis is the mean of the edges' y axes, made perpendicular to x. The result is not finite if the
-    edges coincide.
+    The edges need not be parallel. The sheet's origin is midway between the edges, and x points
+    from the left to the right edge. The y axis is the mean of the edges' y axes, made perpendicular
+    to x. The result is not finite if the edges coincide.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]

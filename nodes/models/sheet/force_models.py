@@ -1,8 +1,9 @@
 """Compute the force of the pushed sheet with interchangeable models.
 
-A model receives depths of a fingertip below the flat sheet, and a `SheetPush`: the stretch ratio,
-the position on the stretched sheet (x, y from its centre, m) and the fingertip's radius. A model
-returns the normal force, its derivative with respect to depth, and the force on each clamp.
+A model receives depths of a fingertip below the flat sheet, and a `SheetPush`. This contains the
+stretch ratio, the position on the stretched sheet (x and y from the sheet's centre, m) and the
+fingertip's radius. A model returns the normal force, its derivative with respect to depth, and the
+force on each clamp.
 
 In order of increasing computing time, the models are `ScaledSheetModel`,
 `nodes.models.sheet.tabulated.TabulatedSheetModel` and `MembraneSheetModel`.
@@ -31,7 +32,8 @@ class SheetPush:
 
     position_m: (x, y) of the fingertip on the stretched sheet, from its centre.
 
-    Raises ValueError for values that are not finite, and for a ratio or radius of 0 or less.
+    Raises ValueError if a value is not finite, or if the stretch ratio or the radius is not
+    positive.
     """
 
     stretch_ratio: float
@@ -47,7 +49,7 @@ class SheetPush:
 
 @dataclass(frozen=True, slots=True)
 class SheetForce:
-    """The result of a force model at depths (n,).
+    """The result of a force model for n push depths.
 
     force_n (n,): normal force.
     stiffness_n_per_m (n,): derivative of the normal force with respect to depth.
@@ -69,9 +71,9 @@ class SheetForceModel(Protocol):
     def rubber(self) -> Rubber: ...
 
     def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
-        """Return the forces at depths (n,), m. The force is zero for depths <= 0.
+        """Return the forces at depths (n,), m. The normal force is zero if the depth is at most 0.
 
-        Raises ValueError for depths that are not finite.
+        Raises ValueError if a depth is not finite.
         """
         ...
 
@@ -90,7 +92,7 @@ def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
 def _check_depths(depths_m: Floats) -> Floats:
     """Return the depths (n,), m, with negative depths set to 0.
 
-    Raises ValueError for NaN or infinity.
+    Raises ValueError if a depth is NaN or infinite.
     """
     depths = np.asarray(depths_m, dtype=np.float64)
     if not np.isfinite(depths).all():
@@ -101,14 +103,16 @@ def _check_depths(depths_m: Floats) -> Floats:
 def relative_position(
     rubber: Rubber, stretch_ratio: float, position_m: SheetPosition
 ) -> tuple[float, float]:
-    """Return coordinates (|x|, |y|) of a position (m), scaled from 0 (centre) to 1 (edge)."""
+    """Return the coordinates (|x|, |y|) of a position (m), scaled to be 0 at the centre and 1 at
+    the edge.
+    """
     half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
     return abs(position_m[0]) / half_width, abs(position_m[1]) / (0.5 * rubber.height_m)
 
 
 MAX_RELATIVE_X = 0.98
-"""The maximum relative x in closed-form models. At x = 1 (the clamp), the force would be
-infinite."""
+"""The maximum relative position x that closed-form models use. At x = 1 (the clamp), the force
+would be infinite."""
 
 
 MAX_STRETCH_RATIO = 1.13
@@ -124,10 +128,11 @@ def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
 
 
 CUBIC_FACTOR = 2.43
-"""The factor c of the force F = c E t W (d/W)^3 of a slack square sheet on a fingertip with a
-radius of 7 mm.
+"""The factor c in the force F = c E t W (d/W)^3 of a slack square sheet. The radius of the
+fingertip is 7 mm.
 
-E is Young's modulus, t the thickness, W the width and d the depth.
+E is Young's modulus, t and W are the thickness and the width of the sheet, and d is the depth of
+the push.
 """
 
 
@@ -153,7 +158,9 @@ def _slack_position_factor(x: float, y: float) -> float:
 def _push_tension(
     rubber: Rubber, stretch_ratio: float, depths: Floats, relative: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """Return the additional force (n,), N, on each clamp due to a push, and the factor E t W, N.
+    """Return the additional force (n,), N, on each clamp due to a push, and the factor E t W (N).
+
+    E is Young's modulus, and t and W are the thickness and the width of the sheet.
 
     depths (n,): depths of the push, m.
     relative: coordinates (x, y) of the push, from 0 (centre) to 1 (edge).
@@ -172,19 +179,21 @@ def _push_tension(
 
 @dataclass(frozen=True, slots=True)
 class ScaledSheetModel:
-    """A closed-form model of the sheet's force: a power of the scaled depth due to the tension,
-    plus a cubic term.
+    """A closed-form model of the sheet's force.
 
-    With the symbols of CUBIC_FACTOR, the stretch ratio s, e = `strain_measure`(s), w = d/W and u =
-    w/sqrt(e) (the scaling of a membrane at small strains):
+    The force is the sum of a power of the scaled depth, which models the tension, and a cubic term.
+
+    E is Young's modulus, t and W are the thickness and width of the sheet, d is the depth and s is
+    the stretch ratio. With e = `strain_measure`(s), w = d/W and u = w/sqrt(e), the force is:
 
         F = E t W (e^(3/2) s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3)
 
-    a, b, c, g, p, q, r and A are fitted. A and c depend on position, fingertip radius and height.
+    a, b, c, g, p, q, r and A are fitted. A and c depend on the position, the fingertip's radius and
+    the sheet's height.
 
     cubic_ratio: ratio of the calibrated cubic term to the cubic term of ideal rubber.
-    stretch_scale: ratio of the calibrated to the nominal stretch ratio, which corrects the slack
-        width of the sheet.
+    stretch_scale: calibrated stretch ratio divided by the nominal stretch ratio. It corrects the
+        slack width of the sheet.
     """
 
     rubber: Rubber
@@ -283,7 +292,7 @@ class MembraneSheetModel:
 
 
 _SLOPE_FRACTION = 0.96
-"""The ratio of a second, smaller depth to the depth of a push.
+"""The ratio of a second, smaller push depth to the depth of a push.
 
 The force at both depths determines the stiffness.
 """
@@ -308,9 +317,9 @@ _INVERSE_GRID = np.geomspace(1e-3, 1.0, 160)
 
 
 def interpolate_inverse(grid: Floats, values: Floats, targets: Floats) -> Floats:
-    """Return the arguments (n,) at which an increasing function reaches the values `targets` (n,).
+    """Return the arguments (n,) at which an increasing function has the values `targets` (n,).
 
-    grid, values: arguments, and function values at these arguments. All are positive.
+    grid, values (k,): arguments, and function values at these k arguments. All are positive.
 
     The logarithms are interpolated linearly. For targets below all values, the power law of the
     first interval is extrapolated. For targets above all values, the result is the last grid point.

@@ -1,12 +1,13 @@
 """Compute the shape of the pushed sheet by a reduced-order model of the membrane.
 
-Finite-element solutions are precomputed over stretch, position and depth of the push. A proper
-orthogonal decomposition reduces the shapes to a dozen modes, and polynomials through Chebyshev
-points interpolate the modes' coefficients. The computation of a shape then takes about 0.1 ms.
+Finite-element solutions are precomputed for a grid of stretch ratios, push positions and push
+depths. A proper orthogonal decomposition reduces the shapes to a dozen modes. Polynomials through
+Chebyshev points interpolate the modes' coefficients. The computation of a shape then takes about
+0.1 ms.
 
-The grid moves with the finger and is densest at the finger, so the tip of the indentation is always
-at the same nodes. Solutions are computed for positions in one quadrant. Solutions for the other
-quadrants follow by symmetry.
+The grid on the sheet moves with the finger and is densest at the finger. Therefore the tip of the
+indentation is always at the same grid nodes. Solutions are computed for positions in one quadrant.
+Solutions for the other quadrants follow by symmetry.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ MAX_TRUNCATION_RMS_M = 2e-5
 """The maximum error (m, root mean square) due to the truncation of the modes."""
 
 MAX_FRACTION_X, MAX_FRACTION_Y = 0.36, 0.40
-"""The maximum |x| and |y| of a precomputed push, as fractions of the sheet's width and height."""
+"""The maximum |x| and |y| of a precomputed push, as fractions of the sheet's width (x) and height
+(y)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class IndentationRange:
 
     stretch_nodes, place_nodes, depth_nodes: numbers of interpolation nodes over stretch, over each
         coordinate of the position, and over depth.
-    element_cells: finite elements along each side.
+    element_cells: number of finite elements along each side of the sheet.
     """
 
     min_stretch: float
@@ -58,8 +60,8 @@ class IndentationRange:
 class IndentationBasis:
     """A reduced-order model of the pushed sheet.
 
-    stretches, xs_m, ys_m, roots: interpolation nodes over stretch, position and depth. `roots` are
-        sqrt(depth / maximum depth).
+    stretches, xs_m, ys_m, roots: interpolation nodes over the stretch ratio, the two coordinates of
+        the position, and the depth. `roots` contains values of sqrt(depth / maximum depth).
     modes: displacement modes (modes, rows, columns, 3), m.
     coefficients: coefficients (stretches, xs, ys, roots, modes) of the modes at the interpolation
         nodes.
@@ -78,7 +80,7 @@ class IndentationBasis:
     def offsets(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> Floats:
-        """Return displacements (rows, columns, 3), m, relative to the flat, uniformly stretched
+        """Return the displacements (rows, columns, 3), m, of grid points from the flat stretched
         sheet.
 
         position_m: (x, y) of the fingertip in the sheet frame. Rows are along y and columns along
@@ -136,8 +138,9 @@ class IndentationBasis:
 
 @dataclass(frozen=True, slots=True)
 class IndentationCase:
-    """The inputs of one finite-element solution of a push: a position (m) and ascending depths
-    (n,), m.
+    """The inputs of one finite-element solution of a push.
+
+    The inputs include a position (m) and n ascending depths (n,), m.
     """
 
     rubber: Rubber
@@ -149,7 +152,10 @@ class IndentationCase:
 
 
 IndentationOffsets = Iterable[Floats]
-"""The displacements (depths, rows, columns, 3), m, of each case, in the order of the cases."""
+"""The displacements of each case, in the order of the cases.
+
+The arrays have the shape (depths, rows, columns, 3) and the unit m. Rows and columns are those of
+the grid on the sheet."""
 
 
 def solve_indentation_basis(
@@ -161,10 +167,11 @@ def solve_indentation_basis(
         solve_indentation, pushes
     ),
 ) -> IndentationBasis:
-    """Compute the membrane at all interpolation nodes, and reduce the shapes to modes.
+    """Compute the shape of the membrane for pushes at all interpolation nodes, and reduce the
+    shapes to modes.
 
-    solve_all: function that solves the cases, in this process or in other processes. The solutions
-        take 45 s on one core.
+    solve_all: function that solves the cases in this process or in other processes. On one core,
+        this takes 45 s.
 
     Raises NoEquilibriumError if a solution does not converge.
     """
@@ -201,8 +208,9 @@ def solve_indentation_basis(
 
 
 def solve_indentation(push: IndentationCase) -> Floats:
-    """Return the finite-element displacements (depths, rows, columns, 3), m, of a push on the
-    model's grid.
+    """Return the finite-element displacements (depths, rows, columns, 3), m, of a push.
+
+    Rows and columns are those of the grid of the reduced-order model.
 
     Raises NoEquilibriumError if a solution does not converge.
     """
@@ -225,9 +233,10 @@ def solve_indentation(push: IndentationCase) -> Floats:
 
 
 def _decompose(samples: Floats) -> tuple[Floats, Floats]:
-    """Decompose samples (n, size) into modes (m, size); return the modes and coefficients (n, m).
+    """Decompose n samples (n, size) into m modes (m, size), and return modes and coefficients (n,
+    m).
 
-    The number m of modes is the smallest number at which the error is below `MAX_TRUNCATION_RMS_M`.
+    m is the smallest number of modes for which the error is below `MAX_TRUNCATION_RMS_M`.
     """
     left, values, modes = np.linalg.svd(samples, full_matrices=False)
     lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / samples.size)
@@ -240,7 +249,9 @@ def _decompose(samples: Floats) -> tuple[Floats, Floats]:
 
 
 def _grade_coordinates(focus_m: float, half_m: float) -> Floats:
-    """Return coordinates (2 HALF_CELLS + 1,), m, from -half_m to half_m, densest at focus_m."""
+    """Return coordinates (2 HALF_CELLS + 1,), m, from -half_m to half_m, which are densest at
+    focus_m.
+    """
     fractions = np.sinh(GRADING * np.linspace(0.0, 1.0, HALF_CELLS + 1)) / np.sinh(GRADING)
     before = focus_m - (half_m + focus_m) * fractions[::-1]
     after = focus_m + (half_m - focus_m) * fractions
@@ -248,7 +259,7 @@ def _grade_coordinates(focus_m: float, half_m: float) -> Floats:
 
 
 def _linear_weights(nodes: Floats, at: Floats) -> Floats:
-    """Return the weights (k, n) of the nodes (n,) in a linear interpolation at points (k,)."""
+    """Return the weights (k, n) of n nodes (n,) in a linear interpolation at k points (k,)."""
     upper = np.clip(np.searchsorted(nodes, at), 1, len(nodes) - 1)
     fraction = np.clip((at - nodes[upper - 1]) / (nodes[upper] - nodes[upper - 1]), 0.0, 1.0)
     result = np.zeros((len(at), len(nodes)))
@@ -264,7 +275,7 @@ def _chebyshev_points(low: float, high: float, count: int) -> Floats:
 
 
 def _barycentric_weights(nodes: Floats, at: float) -> Floats:
-    """Return the weights (n,) of the nodes (n,) in a polynomial interpolation at `at`.
+    """Return the weights (n,) of n nodes (n,) in a polynomial interpolation at the point `at`.
 
     The point `at` is limited to the range of the nodes.
 

@@ -1,6 +1,6 @@
 """Compute the shape and forces of the pushed sheet by finite elements of a membrane.
 
-The elements are bilinear cells with four integration points. The material is incompressible
+The finite elements are bilinear cells with four integration points. The material is incompressible
 Mooney-Rivlin rubber in plane stress. The energy W per volume has the constants C1 and C2. E is
 Young's modulus, and C2 = 0 is a neo-Hookean material:
 
@@ -8,14 +8,14 @@ Young's modulus, and C2 = 0 is a neo-Hookean material:
 
 I1 and I2 are the invariants of the Cauchy-Green tensor C = F'F, where F is the deformation
 gradient. A membrane wrinkles under compression (tension field theory: Pipkin, IMA J. Appl. Math.
-36, 1986). In uniaxial tension, the smaller principal stretch l2 is l1^-1/2, where l1 is the larger
-one. If l2 is below this value, the energy of uniaxial tension is used. If l1 is below 1 too, the
-energy is zero. Stress and tangent (its derivative with respect to the strain) are computed in the
-principal frame of C.
+36, 1986). Let l1 be the larger and l2 the smaller principal stretch. In uniaxial tension, l2 is
+l1^-1/2. If l2 is below l1^-1/2, the energy of uniaxial tension is used. If l1 is also below 1, the
+energy is zero. The stress, and the tangent (the derivative of the stress with respect to the
+strain), are computed in the principal frame of C.
 
 The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Touched nodes stick to
-the sphere. Newton's method computes each equilibrium from the previous equilibrium, with
-Levenberg-Marquardt damping where the slack sheet has no stiffness.
+the sphere. Newton's method computes each equilibrium, starting from the previous equilibrium.
+Levenberg-Marquardt damping is used if parts of the sheet are slack and have no stiffness.
 """
 
 from __future__ import annotations
@@ -39,18 +39,18 @@ MIN_CELL_RADII = 0.3
 STEP_RADII = 0.4
 """The maximum step of the finger's depth, as a multiple of the finger's radius."""
 PENALTY_PER_MODULUS = 2e5
-"""The stiffness of the contact penalty (pressure divided by penetration), in units of E t /
-width^2.
+"""The stiffness of the contact penalty in units of E t / width^2. The stiffness is the pressure
+divided by the penetration.
 
-E is Young's modulus and t is the sheet's thickness.
+E is Young's modulus. t and width are the thickness and the width of the sheet.
 """
 MAX_ITERATIONS = 120
 GAUSS = 0.5 / np.sqrt(3.0)
 """The distance of the integration points from a cell's centre along each axis, divided by the
 cell's side."""
 TOLERANCE = 1e-7
-"""The maximum residual force of a solution, in units of E t width (Young's modulus, thickness,
-width)."""
+"""The maximum residual force of a solution, in units of E t width. E is Young's modulus. t and
+width are the thickness and the width of the sheet."""
 
 
 class NoEquilibriumError(FlexsheetError, ArithmeticError):
@@ -62,12 +62,13 @@ class NoEquilibriumError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class PushPath:
-    """The equilibria of the sheet at depths (n,), m, of one push.
+    """The equilibria of the sheet at n depths of one push.
 
     forces_n (n,): normal force of the sheet on the finger.
     edge_forces_n (n,): mean force on the clamps along the line between them.
     positions (n, rows, columns, 3): positions (m) of the mesh nodes in the sheet's frame.
-    rest_m (rows, columns, 2): positions of these nodes in the slack sheet, relative to its centre.
+    rest_m (rows, columns, 2): positions (m) of these nodes in the slack sheet, relative to the
+        sheet's centre.
     """
 
     depths_m: Floats
@@ -92,8 +93,8 @@ def push_path(
     position_m: (x, y) of the push on the stretched sheet, from its centre.
     cells: number of elements along each side of the sheet.
 
-    Raises NoEquilibriumError if the iteration does not converge, and ValueError for a position
-    outside the sheet, or for depths that are negative or not ascending.
+    Raises NoEquilibriumError if the iteration does not converge. Raises ValueError if the position
+    is outside the sheet, or if the depths are negative or not ascending.
     """
     depths = np.asarray(depths_m, dtype=np.float64)
     if (
@@ -152,7 +153,7 @@ def grade_coordinates(length_m: float, focus_m: float, finest_m: float, cells: i
     """Return node coordinates (cells + 1,) from 0 to length_m, which are densest at the focus.
 
     finest_m: size of the cells at the focus. On each side, distances from the focus are
-        proportional to sinh(k u) with uniform u from 0 to 1.
+        proportional to sinh(k u), with uniformly spaced values u from 0 to 1.
     """
     left_cells = int(np.clip(round(cells * focus_m / length_m), cells // 4, cells - cells // 4))
 
@@ -231,7 +232,7 @@ class _Grid:
         return float(self.volume @ relaxed_energy(large, small, self.c1, self.c2)[0])
 
     def gradient(self, positions: Floats) -> Floats:
-        """Return the gradient (3 nodes,) of the elastic energy, which contains the nodal forces
+        """Return the gradient (3 nodes,) of the elastic energy, which consists of the nodal forces
         (N).
         """
         deformed, c = self.strain(positions)
@@ -241,14 +242,16 @@ class _Grid:
         return self._assemble(local)
 
     def _assemble(self, local: Floats) -> Floats:
-        """Sum the forces (points, 4, 3) of the integration points to nodal forces (3 nodes,), N."""
+        """Add up the forces (points, 4, 3) of the integration points at each node, and return nodal
+        forces (3 nodes,), N.
+        """
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
     def _scatter(self, blocks: Floats) -> Floats:
-        """Sum the stiffnesses (points, ...) of the integration points to entries of the sparse
-        stiffness matrix.
+        """Add up the stiffnesses (points, ...) of the integration points, and return the entries of
+        the sparse stiffness matrix.
         """
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
@@ -261,7 +264,7 @@ class _Grid:
         free coordinates.
 
         added (nodes, 3, 3): stiffness of the contact, N/m.
-        free (3 nodes,): whether each coordinate may move.
+        free (3 nodes,): whether each coordinate of the nodes is free to move.
         damping: value (N/m) that is added to the diagonal.
         """
         deformed, c = self.strain(positions)
@@ -296,7 +299,8 @@ class _Grid:
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the larger and the smaller eigenvalues (n,) of C (n, 2, 2), and directions (n, 2).
+    """Return the larger and the smaller eigenvalues (n,) of n tensors C (n, 2, 2), and directions
+    (n, 2).
 
     The directions are the unit eigenvectors of the larger eigenvalues.
     """
@@ -311,7 +315,7 @@ def relaxed_energy(
 ) -> tuple[Floats, Floats, Floats]:
     """Return the energy W per rest volume according to tension field theory, and its derivatives.
 
-    large, small (n,): squared principal stretches p >= q.
+    large, small (n,): squared principal stretches p and q, with p >= q.
     c1, c2: material constants, Pa.
 
     The results are W (n,), its first derivatives [W_p, W_q] (2, n) and its second derivatives
@@ -378,8 +382,8 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _FingerContact:
-    """A penalty model of the contact of mesh nodes with the fingertip. Sticking nodes have no
-    penalty.
+    """A penalty model of the contact between mesh nodes and the fingertip. Nodes that stick to the
+    fingertip have no penalty.
     """
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
@@ -412,8 +416,8 @@ class _FingerContact:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium by scaling the indentation to the new depth. The first
-    indentation is a cone.
+    """Predict the next equilibrium from the current indentation, scaled to the new depth. For the
+    first step, the indentation is a cone.
 
     push: current depth and its increase in this step (m).
     """
@@ -430,8 +434,8 @@ def _predict_state(
 
 
 def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None) -> Floats:
-    """Compute the equilibrium near the positions `start`, while clamped and sticking nodes are
-    fixed.
+    """Compute the equilibrium of the sheet, starting from the node positions `start`. Clamped and
+    sticking nodes are fixed.
 
     Raises NoEquilibriumError if the iteration does not converge.
     """
@@ -478,6 +482,6 @@ def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None
     if residual < 100.0 * TOLERANCE * grid.force_scale:
         return positions
     raise NoEquilibriumError(
-        f"the membrane has no equilibrium: the residual is {residual:.2e} N, the tolerance "
-        f"is {TOLERANCE * grid.force_scale:.2e} N"
+        f"the membrane has no equilibrium: the residual is {residual:.2e} N, but the "
+        f"tolerance is {TOLERANCE * grid.force_scale:.2e} N; reduce the push depth"
     )

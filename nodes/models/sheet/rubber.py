@@ -13,10 +13,10 @@ class Rubber:
 
     width_m: distance between the clamped edges.
     height_m: length of an edge.
-    mooney_ratio: C2 / (C1 + C2) of incompressible Mooney-Rivlin rubber, from 0 (neo-Hookean) to
-        below 1. Young's modulus is E = 6 (C1 + C2).
+    mooney_ratio: ratio C2 / (C1 + C2) of the constants of incompressible Mooney-Rivlin rubber, at
+        least 0 (neo-Hookean) and less than 1. Young's modulus is E = 6 (C1 + C2).
 
-    Raises ValueError for a value outside its range.
+    Raises ValueError if a value is outside its valid range.
     """
 
     width_m: float

@@ -2,8 +2,8 @@
 
 A ratio is the measured or computed force divided by the force of the closed-form model.
 
-The ratio varies slowly, so a coarse table is sufficient. The table is also used for fingertips of
-other radii.
+The ratio varies slowly, so a coarse table is sufficient. A table for one fingertip radius is also
+used for other radii.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from flexsheet.nodes.models.sheet.force_models import (
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Measure = Callable[[float, Floats, SheetPosition], Floats]
-"""A function that returns forces (n,), N, at a stretch ratio, depths (n,), m, and a position."""
+"""A function that returns forces (n,), N. Its arguments are a stretch ratio, n depths (n,), m, and
+a position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +33,11 @@ class TabulatedSheetModel:
     """A model that multiplies the force of the scaled model by ratios from a table.
 
     stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes of the table. Positions are
-        in one quadrant, because the sheet is symmetric.
-    ratios (a, b, c, d): ratios, interpolated linearly over stretches and positions, and by monotone
-        cubics over depths. Beyond the ends of an axis, the ratios are constant.
+        in only one quadrant, because the sheet is symmetric.
+    ratios (a, b, c, d): ratios. They are interpolated linearly over stretches and positions, and by
+        monotone cubics over depths. Beyond the ends of an axis, they are constant.
 
-    Raises ValueError for axes that are not ascending, or for invalid ratios.
+    Raises ValueError if an axis is not ascending, or if a ratio is invalid.
     """
 
     base: ScaledSheetModel
@@ -102,7 +103,9 @@ class TabulatedSheetModel:
 
 
 def _interpolate_linear(axis: Floats, value: float, entries: Floats) -> Floats:
-    """Interpolate entries (n, ...) linearly along their first axis.
+    """Interpolate entries (n, ...) linearly at `value` along their first axis.
+
+    axis (n,): coordinates of the entries.
 
     The results are constant beyond the ends of the axis.
     """

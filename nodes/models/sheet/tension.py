@@ -1,6 +1,4 @@
-"""Compute the edge force and the sag of a sheet that nothing touches, and the stiffness of small
-pushes.
-"""
+"""Compute the edge force and the sag of an untouched sheet, and the stiffness of small pushes."""
 
 from __future__ import annotations
 
@@ -13,35 +11,37 @@ from numpy.typing import NDArray
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 CLAMP_FACTOR, CLAMP_FACTOR_PER_ASPECT = 1.004, 0.0735
-"""The coefficients a, b of a factor for the edge force of uniaxial tension: a + b height / width.
+"""The coefficients a and b of the factor a + b height / width, by which the edge force of uniaxial
+tension is multiplied.
 
-The factor is above 1 because the clamps prevent the sheet from narrowing. The formula is within 0.3
-% of membrane finite elements for height / width from 0.5 to 1.5 and stretch ratios up to 1.12.
+The factor is above 1 because the clamps prevent the sheet from narrowing. The formula agrees with
+membrane finite elements within 0.3 % for height / width from 0.5 to 1.5 and stretch ratios up to
+1.12.
 """
 
 SAG_PROFILE = (0.9635, 0.23, 1.96)
-"""The coefficients a, b, c of the profile a + b v^2 + c v^4 of the sag over v = y / height.
+"""The coefficients a, b and c of the sag profile a + b v^2 + c v^4, where v = y / height.
 
 The profile is the ratio of the sag to the sag of a sheet with uniform tension. Free edges sag more
-than the centre. The formula is within 1 % of membrane finite elements for a square sheet with
-stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
+than the centre. The formula agrees with membrane finite elements within 1 %. This is valid for a
+square sheet with stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
 """
 
 GRAVITY_M_PER_S2 = 9.81
 """The gravitational acceleration, m/s^2, along the negative y axis of the world."""
 
 PUSH_FACTOR = 0.95
-"""The factor by which edge force / width is multiplied to obtain the stiffness of a small push.
+"""The ratio of the stiffness of a small push to the edge force per sheet width.
 
-The factor is 0.9 to 1.0 for a fingertip with a radius of 10 mm.
+For a fingertip with a radius of 10 mm, the ratio is 0.9 to 1.0.
 """
 
 
 def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
-    """Return the ratio of the nominal stress to Young's modulus in uniaxial tension of rubber.
+    """Return the nominal stress of rubber in uniaxial tension, divided by Young's modulus.
 
-    The ratio is (s - s^-2)/3 (1 - m + m/s) with the stretch ratio s and the Mooney ratio m. The
-    ratio is 0 for a slack sheet.
+    The result is (s - s^-2)/3 (1 - m + m/s) with the stretch ratio s and the Mooney ratio m. The
+    result is 0 if the sheet is slack.
     """
     s = max(stretch_ratio, 1.0)
     return (s - s**-2) / 3.0 * (1.0 - mooney_ratio + mooney_ratio / s)
@@ -68,8 +68,8 @@ class SlackSheet(Protocol):
 
 
 def edge_force_n(stretch_ratio: float, sheet: SlackSheet, *, mooney_ratio: float = 0.0) -> float:
-    """Return the force (N) on each clamped edge if nothing touches the sheet; 0 for a slack
-    sheet.
+    """Return the force (N) on each clamped edge of a sheet that nothing touches. The force is 0 if
+    the sheet is slack.
     """
     return _area_modulus_n(sheet) * strain_measure(stretch_ratio, mooney_ratio)
 
@@ -122,14 +122,14 @@ def compute_sag_m(
     """Return the displacement (m) of an untouched sheet along its normal due to its weight.
 
     normal: unit normal (3,) of the sheet in the world frame.
-    across: positions between the clamps, from 0 to 1, of any shape.
-    along: positions along the clamps as fractions of the height, from -0.5 to 0.5, of the same
-        shape.
+    across: positions between the clamps, from 0 to 1. The array can have any shape.
+    along: positions along the clamps, from -0.5 to 0.5, as fractions of the height. The array has
+        the same shape as `across`.
 
-    The shape of the sheet is the parabola z = 4 sag u (1 - u), with u = `across`. Equilibrium over
-    the edges' distance L requires 8 N sag / L^2 = load per area. The tension N per length increases
-    with the length L (1 + 8/3 (sag/L)^2) of the parabola. Therefore a slack sheet has a finite sag,
-    too.
+    The shape of the sheet is the parabola z = 4 sag u (1 - u), with u = `across`. Let L be the
+    distance between the edges, and N the tension per length. Equilibrium requires 8 N sag / L^2 =
+    load per area. N increases with the length L (1 + 8/3 (sag/L)^2) of the parabola. Therefore the
+    sag of a slack sheet is also finite.
     """
     stretch = edge_distance_m / rubber.width_m
     load_pa = -GRAVITY_M_PER_S2 * density_kg_per_m3 * rubber.thickness_m / stretch * normal[1]
