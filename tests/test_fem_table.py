@@ -210,6 +210,22 @@ def test_the_curve_is_what_pushes_then_give(body: TableSoftBody) -> None:
     assert body.stiffness_n_per_m(there.surface) == pytest.approx(secant)
 
 
+def test_the_force_curve_between_unlike_nodes_never_falls(
+    model: SoftBodyModel, table: Table
+) -> None:
+    random = np.random.default_rng(3)
+    factors = random.uniform(0.0, 1.0, (*table.force_n.shape[:2], 1))
+    uneven = soft_body(
+        model.response,
+        model.response.rest[model.bounds],
+        replace(table, force_n=table.force_n * factors),
+    )
+    for angle, x in random.uniform((-0.9, -0.02), (0.9, 0.02), (200, 2)):
+        forces = uneven.force_curve(push(x, angle, 0.001).surface)[:, 1]
+        assert forces[0] == 0.0
+        assert (np.diff(forces) >= 0.0).all()
+
+
 def test_a_finger_in_the_air_moves_nothing(body: TableSoftBody) -> None:
     answer = body.respond(push(0.0, 0.0, -0.01))
     assert not answer.displacement.any()

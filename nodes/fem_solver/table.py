@@ -477,8 +477,13 @@ class TableSoftBody:
         return self._curve_at(nodes, weights)
 
     def _curve_at(self, nodes: Ints, weights: Floats) -> Floats:
+        """Return the force curve (n, 2) of a skin point, interpolated between nodes.
+
+        Some of the weights are negative, so the sum of curves that do not fall can fall.
+        """
         result = np.empty((len(self._depths), 2))
-        result[:, 0], result[:, 1] = self._depths, weights @ self._curves[nodes]
+        result[:, 0] = self._depths
+        result[:, 1] = np.maximum.accumulate(np.maximum(weights @ self._curves[nodes], 0.0))
         return result
 
     def _curve(self, number: int, normal: Floats) -> Floats:
