@@ -224,8 +224,10 @@ class FilmedFinger:
             left=left,
             right=right,
         )
-        self._node.on_stereo(pair, self._stamp(at_ns))
+        processed = self._node.measure_fingertip(pair, self._stamp(at_ns))
+        assert processed is not None
         assert self._found is not None
+        self._node.search_surroundings(processed)
         return self._found.predicted_path_world_m
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -54,6 +56,24 @@ TIMEOUT_PERIODS = 2.5
 
 SAME_POINT_M = 0.001
 """The maximum distance between two points of an image pair that are treated as the same marker."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessedPair:
+    """An image pair whose fingertip is published.
+
+    at_ns: timestamp of the exposure.
+    reason: "ok", or why no fingertip was measured.
+    measured: marker of the finger, or None if it was not found.
+    detection: markers that were found near the expected fingertip.
+    detect: function that detects all markers in the pair.
+    """
+
+    at_ns: int
+    reason: FingertipReason
+    measured: TriangulatedPoint | None
+    detection: StereoDetection
+    detect: Callable[..., StereoDetection]
 
 
 class Triangulator(Node):
@@ -147,9 +167,21 @@ class Triangulator(Node):
             self.tracking = replace(self.tracking, track_timeout_s=timeout_s)
             self.tracker.settings = self.tracking
 
-    def on_stereo(self, pair: StereoPair, header: Header) -> None:
+    async def on_stereo(self, pair: StereoPair, header: Header) -> None:
+        processed = self.measure_fingertip(pair, header)
+        if processed is not None:
+            # A planner in the same process handles the fingertip before the search below.
+            await asyncio.sleep(0)
+            self.search_surroundings(processed)
+
+    def measure_fingertip(self, pair: StereoPair, header: Header) -> ProcessedPair | None:
+        """Measure the fingertip in an image pair, and publish it.
+
+        Returns None if no scene has arrived. `search_surroundings` must be called with any other
+        result before the next pair is processed. Raises ValueError if the images are invalid.
+        """
         if self.geometry is None:
-            return
+            return None
         check_images(pair, self.geometry)
         at_ns = header.source_ns
         if header.epoch != self.epoch:  # The camera has restarted, so its times start again.
@@ -193,12 +225,16 @@ class Triangulator(Node):
                 offset_m=self.pad_to_marker_m,
             )
             self.fingertip.publish(fingertip, source_ns=at_ns)
-        if reason == "ok" and self.association.is_clutter_search_due(at_ns):
-            # Search after publishing, since no other node waits for the clutter.
-            found = detect_pair(gate=None)
+        return ProcessedPair(at_ns, reason, measured, found, detect_pair)
+
+    def search_surroundings(self, processed: ProcessedPair) -> None:
+        """Search an image pair for clutter if this is due, and update the self-checks."""
+        found = processed.detection
+        if processed.reason == "ok" and self.association.is_clutter_search_due(processed.at_ns):
+            found = processed.detect(gate=None)
             others = self._check.exclude_marks(found, tracked=False)
-            self.association.track_clutter(at_ns, others)
-        self._update_self_checks(at_ns, reason, measured, found)
+            self.association.track_clutter(processed.at_ns, others)
+        self._update_self_checks(processed.at_ns, processed.reason, processed.measured, found)
         self._note()
 
     def _update_self_checks(
