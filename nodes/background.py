@@ -31,7 +31,25 @@ def enter_real_time(priority: int) -> None:
             os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(priority))
 
 
-def leave_real_time() -> None:
-    """Give the calling thread the normal scheduling policy, if it inherited real-time priority."""
-    if os.sched_getscheduler(0) == os.SCHED_RR:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+def leave_real_time(thread: int = 0) -> bool:
+    """Give a thread the normal scheduling policy, and return whether it had real-time priority.
+
+    thread: ID of the thread; 0 means the calling thread.
+    """
+    if os.sched_getscheduler(thread) != os.SCHED_RR:
+        return False
+    os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+def end_real_time(pid: int) -> bool:
+    """Call `leave_real_time` for all threads of a process, and return whether one had it.
+
+    Returns False if the process has ended.
+    """
+    found = False
+    with suppress(FileNotFoundError):
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            with suppress(ProcessLookupError):
+                found |= leave_real_time(int(thread))
+    return found

@@ -28,10 +28,12 @@ from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs, supervisor
+from flexsheet.launch.running.cpu import CpuWatch
 from flexsheet.launch.running.priority import find_real_time_priority, min_nice_step
 from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
 from flexsheet.messages.bag import BagReader
+from flexsheet.messages.types import CpuPressure
 from tests.waiting import DEADLINE_S, until, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -135,6 +137,25 @@ async def test_a_ready_node_has_its_real_time_priority_if_the_user_may_set_it(
         assert os.sched_getscheduler(graph.pids["listener"]) == os.SCHED_OTHER
         log = (graph.run.logs / "launch.log").read_text()
         assert ("may not set the `nice` or `realtime_priority`" in log) is not granted
+
+
+async def test_real_time_is_withdrawn_if_another_node_gets_no_processor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting = CpuPressure(busy=True, wait_ratio=0.5, node="listener", programs=())
+    found = [waiting]
+    monkeypatch.setattr(CpuWatch, "update", lambda *_, **__: found[-1])
+    lines: list[str] = []
+    plan = plan_of(tmp_path, beacon=beacon(realtime_priority=7), listener=LISTENER)
+    async with RunningGraph(plan, report=lambda _, line: lines.append(line)) as graph:
+        await graph.wait_ready()
+        pid = graph.pids["beacon"]
+        granted = os.sched_getscheduler(pid)
+        found.append(waiting.model_copy(update={"wait_ratio": 0.9}))
+        if granted == os.SCHED_RR:
+            text = "beacon continue without real-time priority"
+            await until(lambda: any(text in line for line in lines), "the report")
+        assert os.sched_getscheduler(pid) == os.SCHED_OTHER
 
 
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:

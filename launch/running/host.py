@@ -35,6 +35,7 @@ from flexsheet.messages.security import KeyChange, KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import (
     ArmState,
+    CpuPressure,
     EStop,
     HostKey,
     HostStatus,
@@ -42,11 +43,15 @@ from flexsheet.messages.types import (
     NodeProcess,
 )
 from flexsheet.nodes import NodeRole
+from flexsheet.nodes.background import end_real_time
 from flexsheet.nodes.node import Output, PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
+STARVED_WAIT_RATIO = 0.8
+"""The minimum fraction of time without a processor at which real-time priorities are withdrawn."""
+
 REASON_LENGTH = 1000
 """The maximum number of characters of an e-stop's reason, so that it fits into every message."""
 
@@ -116,6 +121,7 @@ class HostAgent:
         self._devices, self._folder = list_device_files(nodes), find_recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
         self._nice_denied = bool(list_denied(nodes))
+        self._real_time = {node.name for node in nodes if node.realtime_priority is not None}
 
     def start(self) -> None:
         """Subscribe to e-stops and start to publish. An event loop must be running."""
@@ -297,6 +303,20 @@ class HostAgent:
             self._busy_reported_ns = now_ns
             remedy = describe_busy_remedy(nice_denied=status.nice_denied)
             self._on_problem(f"{describe_busy(status)}; {remedy}")
+        self._limit_real_time(status.cpu)
+
+    def _limit_real_time(self, pressure: CpuPressure | None) -> None:
+        """Withdraw the real-time priorities of this graph if another node gets no processor."""
+        if pressure is None or pressure.wait_ratio < STARVED_WAIT_RATIO:
+            return
+        pids = self._pids()
+        changed = [name for name in self._real_time & pids.keys() if end_real_time(pids[name])]
+        if changed:
+            self._on_problem(
+                f"{pressure.node} waited for a processor {pressure.wait_ratio:.0%} of the time, so "
+                f"{', '.join(sorted(changed))} continue without real-time priority; run fewer "
+                "programs on this computer"
+            )
 
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
