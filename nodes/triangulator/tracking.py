@@ -109,6 +109,7 @@ class Tracker:
         self._history: list[tuple[PositionMeasurement, Estimate]] = []
         self._tentative_track: list[PositionMeasurement] = []
         self._late: list[PositionMeasurement] = []
+        self._gate: tuple[tuple[PositionMeasurement, Estimate], int, Gate] | None = None
 
     @property
     def estimate(self) -> Estimate | None:
@@ -136,7 +137,11 @@ class Tracker:
         """
         if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
-        return self._gate_after(*self._history[-1], at_ns)
+        newest = self._history[-1]
+        # The detector, the data association and the update use the same gate.
+        if self._gate is None or self._gate[0] is not newest or self._gate[1] != at_ns:
+            self._gate = newest, at_ns, self._gate_after(*newest, at_ns)
+        return self._gate[2]
 
     def _gate_after(self, measurement: PositionMeasurement, estimate: Estimate, at_ns: int) -> Gate:
         dt = (at_ns - estimate.at_ns) * 1e-9
