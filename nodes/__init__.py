@@ -78,12 +78,29 @@ class UnknownNodeError(FlexsheetError, KeyError):
     remedy = "`flexsheet node types` prints all names."
 
 
+class NodeImportError(FlexsheetError, ImportError):
+    """An error for a node class "module:Class" that cannot be imported.
+
+    advice: text that states how to correct this error.
+    """
+
+    code = "node-import"
+    remedy = (
+        "Write PYTHONPATH=FOLDER before the command, where FOLDER contains the module of the node, "
+        "or install its package. Commands that evaluate a graph or a bag need its nodes, too."
+    )
+
+    def __init__(self, name: str, problem: str, advice: str) -> None:
+        super().__init__(f'"{name}" cannot be imported: {problem}; {advice}')
+        self.problem, self.advice = problem, advice
+
+
 def node_class(name: str) -> type[Node]:
     """Import and return the class of a node type, which is a name in `NODES` or "module:Class".
 
     The package name may be missing, as in "nodes.planner.node:Planner" in old launch files and
-    bags. Raises UnknownNodeError if the name is unknown, ImportError if the module is missing, and
-    AttributeError if the class is missing.
+    bags. Raises UnknownNodeError if the name is unknown, and NodeImportError if the module or the
+    class is missing or invalid.
     """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")
@@ -96,4 +113,21 @@ def node_class(name: str) -> type[Node]:
         hint = f'; did you mean "{near[0]}"?' if near else f"; known nodes: {', '.join(NODES)}"
         hint += '; name a node of your own as "module:Class"'
         raise UnknownNodeError(f'unknown node type "{name}"{hint}')
-    return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]
+    try:
+        return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]
+    except (ImportError, AttributeError, SyntaxError) as error:
+        advice = _describe_import_advice(module_name, class_name, error)
+        raise NodeImportError(name, str(error), advice) from error
+
+
+def _describe_import_advice(module: str, class_name: str, error: Exception) -> str:
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        if module == error.name or module.startswith(f"{error.name}."):
+            return (
+                "write PYTHONPATH=FOLDER before the command, where FOLDER contains "
+                f"{module.replace('.', '/')}.py, or install the package"
+            )
+        return f"install the module {error.name}: pip install {error.name.partition('.')[0]}"
+    if isinstance(error, AttributeError):
+        return f"define the class {class_name} in {module}, or correct its name"
+    return f"correct the module {module}"

@@ -257,6 +257,16 @@ def find_ports(node_class: type[Node]) -> dict[str, Port]:
     return ports
 
 
+def find_unmatched_handlers(node_class: type[Node]) -> list[str]:
+    """Return the message handlers of a node class, such as "on_fingertip", that have no input."""
+    inputs = {port.name for port in find_ports(node_class).values() if port.direction == "input"}
+    return [
+        name
+        for name, _ in inspect.getmembers(node_class, inspect.isfunction)
+        if name.startswith("on_") and name[3:] not in inputs and not hasattr(Node, name)
+    ]
+
+
 def further_port(topic_name: str) -> str:
     """Return the name of the port for a topic that `Node.further_inputs` has returned."""
     return f"in/{topic_name}"

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, EStop, Fingertip, ParameterChange, Side, TwinFinger
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 from flexsheet.nodes.recorder.node import Recorder
@@ -77,6 +78,15 @@ class Beacon(Node):
         )
         while self.parameters.unreachable and self.count > 2:
             time.sleep(1.0)
+
+
+class MisspelledHandler(Beacon):
+    """A node with a handler whose name differs from that of its input."""
+
+    scene: Input[Scene]
+
+    def on_scen(self, scene: Scene, header: Header) -> None:
+        raise AssertionError("no message can arrive")
 
 
 class RelayParameters(NodeParameters):

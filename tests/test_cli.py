@@ -28,7 +28,7 @@ from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Display, EStop, PortStatus, Status
-from flexsheet.nodes import NODES
+from flexsheet.nodes import NODES, NodeImportError
 from tests.commands import Command
 from tests.test_doctor_hosts import make_status
 from tests.waiting import DEADLINE_S, wait_until
@@ -438,6 +438,21 @@ def test_a_parameter_is_read_and_changed_in_the_running_graph(
     assert lines[0].split() == ["parameter", "value", "live"]
     recorded = next(line for line in lines if line.startswith("recorder.topics "))
     assert "null" in recorded or "[" in recorded
+
+
+def test_parameters_of_a_node_that_cannot_be_imported_here_are_listed(
+    flexsheet: Command, running: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(name: str) -> None:
+        raise NodeImportError(name, "no module", "write PYTHONPATH=FOLDER before the command")
+
+    monkeypatch.setattr("flexsheet.nodes.node_class", refuse)
+    rows = {row["parameter"]: row for row in flexsheet("param", "list", "--json").json()}
+    assert rows["beacon.rate_hz"]["live"] is None
+    assert flexsheet("param", "get", "beacon.rate_hz").code == 0
+    printed = flexsheet("param", "set", "beacon.rate_hz", "3")
+    assert printed.code == 1
+    assert "PYTHONPATH=FOLDER" in printed.err
 
 
 @pytest.mark.parametrize(

@@ -356,6 +356,14 @@ def test_an_error_in_an_extended_file_names_that_file(tmp_path: Path) -> None:
     )
 
 
+def test_a_handler_without_an_input_is_an_error_with_the_similar_name(tmp_path: Path) -> None:
+    text = GRAPH.replace(f"type: {BEACON}", "type: tests.launch_nodes:MisspelledHandler")
+    assert 'the method on_scen of "tests.launch_nodes:MisspelledHandler" handles no input; ' in (
+        found := complaint(tmp_path, text)
+    )
+    assert 'did you mean "on_scene"' in found
+
+
 @pytest.mark.parametrize(
     ("type_name", "remedy"),
     [

@@ -13,7 +13,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.topics import Topic, UnknownTopicError
 from flexsheet.messages.types import EStop, FingerPath, Fingertip, SheetTarget
-from flexsheet.nodes import NODES, UnknownNodeError, node_class
+from flexsheet.nodes import NODES, NodeImportError, UnknownNodeError, node_class
 from flexsheet.nodes.node import (
     Input,
     Node,
@@ -119,6 +119,13 @@ def test_every_node_of_the_table_imports_and_declares_its_ports() -> None:
         assert class_.__doc__
     with pytest.raises(UnknownNodeError, match='did you mean "planner"'):
         node_class("planer")
+
+
+def test_a_class_that_cannot_be_imported_is_an_error_with_a_remedy() -> None:
+    with pytest.raises(NodeImportError, match="PYTHONPATH=FOLDER before the command"):
+        node_class("missing.module:Thing")
+    with pytest.raises(NodeImportError, match="define the class Thing in tests"):
+        node_class("tests.launch_nodes:Thing")
 
 
 async def test_an_error_in_a_handler_is_counted_and_shown_and_the_node_continues() -> None:

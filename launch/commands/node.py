@@ -61,7 +61,7 @@ def info(
     parameter values.
     """
     from flexsheet.messages.field_types import describe_field
-    from flexsheet.nodes import UnknownNodeError, node_class
+    from flexsheet.nodes import NodeImportError, UnknownNodeError, node_class
     from flexsheet.nodes.node import find_parameters_type, find_ports, find_timers
 
     try:
@@ -71,7 +71,7 @@ def info(
     node_type = node if found is None else found.type
     try:
         class_ = node_class(node_type)
-    except (UnknownNodeError, ImportError, AttributeError) as error:
+    except (UnknownNodeError, NodeImportError) as error:
         raise CommandError(str(error)) from error
     fields = {"type": node_type, "about": (class_.__doc__ or "").strip()}
     ports: list[dict[str, Any]] = [

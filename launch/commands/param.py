@@ -63,12 +63,15 @@ def list_parameters(
     """List the parameters of the running graph, and state which can be changed while it runs."""
     plan, found = running_graph(run)
     nodes = [find_node(plan, node)] if node else list(plan.nodes.values())
-    changed = _read_changes(plan, found, {one.name for one in nodes if _live(one)})
+    live = {one.name: _find_live(one) for one in nodes}
+    changed = _read_changes(
+        plan, found, {name for name, names in live.items() if names is None or names}
+    )
     rows = [
         {
             "parameter": f"{one.name}.{name}",
             "value": changed.get(one.name, {}).get(name, value),
-            "live": name in _live(one),
+            "live": None if (names := live[one.name]) is None else name in names,
         }
         for one in nodes
         for name, value in one.parameters.items()
@@ -87,7 +90,8 @@ def get_parameter(
     """Print the value of a parameter of the running graph."""
     plan, found = running_graph(run)
     node, name = _find_parameter(plan, parameter)
-    live = {node.name} if name in _live(node) else set()
+    names = _find_live(node)
+    live = {node.name} if names is None or name in names else set()
     changed = _read_changes(plan, found, live).get(node.name, {})
     value = changed.get(name, node.parameters[name])
     if as_json:
@@ -120,8 +124,9 @@ def set_parameter(
 
     plan, found = running_graph(run)
     node, name = _find_parameter(plan, parameter)
-    if name not in _live(node):
-        live = ", ".join(f"{node.name}.{one}" for one in sorted(_live(node))) or "none"
+    names = node_class(node.type).live_parameters
+    if name not in names:
+        live = ", ".join(f"{node.name}.{one}" for one in sorted(names)) or "none"
         raise CommandError(
             f"{parameter}: this parameter cannot change while the node runs; start the graph again "
             f"with --set {parameter}={value} (parameters that can change: {live})"
@@ -153,10 +158,17 @@ def _find_parameter(plan: ResolvedGraph, text: str) -> tuple[ResolvedNode, str]:
     return node, name
 
 
-def _live(node: ResolvedNode) -> frozenset[str]:
-    from flexsheet.nodes import node_class
+def _find_live(node: ResolvedNode) -> frozenset[str] | None:
+    """Return the parameters that can change while the node runs.
 
-    return node_class(node.type).live_parameters
+    Returns None if the class of the node cannot be imported here.
+    """
+    from flexsheet.nodes import NodeImportError, node_class
+
+    try:
+        return node_class(node.type).live_parameters
+    except NodeImportError:
+        return None
 
 
 def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:

@@ -17,7 +17,7 @@ from flexsheet.launch.plans.documents import (
 )
 from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, find_file, name_shipped
-from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
+from flexsheet.nodes import NodeImportError, NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
 
 RECORDER_NICE = 5
@@ -285,5 +285,5 @@ def _find_role(type_name: object) -> NodeRole | None:
     """Return the role of a node type, or None if its class has no role or cannot be imported."""
     try:
         return find_role(node_class(str(type_name)))
-    except (UnknownNodeError, ImportError, AttributeError, TypeError):
+    except (UnknownNodeError, NodeImportError, TypeError):
         return None

@@ -19,13 +19,14 @@ from flexsheet.messages.marker_calibration import load_marker_calibration, refus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
 from flexsheet.messages.topics import TOPICS, Topic
-from flexsheet.nodes import NODES, UnknownNodeError, node_class
+from flexsheet.nodes import NODES, NodeImportError, UnknownNodeError, node_class
 from flexsheet.nodes.node import (
     Node,
     NodeParameters,
     Port,
     find_parameters_type,
     find_ports,
+    find_unmatched_handlers,
     further_port,
 )
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
@@ -155,12 +156,9 @@ def resolve_entry(entry: NodeEntry, document: Document) -> None:
             (*key, "type"), f'unknown node type "{type_name}"', did_you_mean(type_name, list(NODES))
         )
         return
-    except (ImportError, AttributeError, SyntaxError) as error:
-        document.report(
-            (*key, "type"),
-            f'"{type_name}" cannot be imported: {error}',
-            _describe_import_remedy(type_name, error),
-        )
+    except NodeImportError as error:
+        text = f'"{type_name}" cannot be imported: {error.problem}'
+        document.report((*key, "type"), text, error.advice)
         return
     if not (isinstance(class_, type) and issubclass(class_, Node)):
         document.report(
@@ -183,21 +181,6 @@ def resolve_entry(entry: NodeEntry, document: Document) -> None:
             document.problems.extend(error.problems)
 
 
-def _describe_import_remedy(type_name: str, error: Exception) -> str:
-    module, _, name = type_name.partition(":")
-    if isinstance(error, ModuleNotFoundError) and error.name:
-        if module == error.name or module.startswith(f"{error.name}."):
-            file = f"{module.replace('.', '/')}.py"
-            return (
-                f"write PYTHONPATH=FOLDER before the command, where FOLDER contains {file}, or "
-                "install the package"
-            )
-        return f"install the module {error.name}: pip install {error.name.partition('.')[0]}"
-    if isinstance(error, AttributeError):
-        return f"define the class {name} in {module}, or correct its name"
-    return f"correct the module {module}"
-
-
 def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
     """Insert `value` at `key`, unless the document already contains that key."""
     target: Any = document.values
@@ -208,6 +191,13 @@ def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
 
 def _connect_ports(entry: NodeEntry, class_: type[Node], document: Document) -> None:
     ports = find_ports(class_)
+    handlers = [f"on_{port.name}" for port in ports.values() if port.direction == "input"]
+    for name in find_unmatched_handlers(class_):
+        document.report(
+            (*entry.key, "type"),
+            f'the method {name} of "{entry.spec.type}" handles no input',
+            did_you_mean(name, handlers),
+        )
     for name in entry.spec.topics:
         if name not in ports:
             document.report(
@@ -233,7 +223,10 @@ def _connect_ports(entry: NodeEntry, class_: type[Node], document: Document) -> 
             document.report(
                 key,
                 f'port "{port.name}" is not connected',
-                f'name its topic in "topics": {names or "no topic has this type"}',
+                f'name its topic in "topics": {names}'
+                if fitting
+                else f"no topic has the message type {port.message.__name__}; add a topic to "
+                "messages/topics.py, or use a message type of `flexsheet topic list --all`",
             )
         elif topic.message is not port.message:
             document.report(
