@@ -89,6 +89,12 @@ class MisspelledHandler(Beacon):
         raise AssertionError("no message can arrive")
 
 
+class UnreachableParameter(Beacon):
+    """A node with a live parameter, but without an input for its changes."""
+
+    live_parameters: ClassVar[frozenset[str]] = frozenset({"rate_hz"})
+
+
 class RelayParameters(NodeParameters):
     rate_hz: float = 10.0
     random: bool = False

@@ -271,7 +271,7 @@ async def run_session(folder: Path) -> PageVisit:
     scenes.mkdir()
     for name in ("cylinder", "sphere"):
         shutil.copy(ROOT / "launch" / "scenes" / f"{name}.yaml", scenes)
-    (scenes / "broken.yaml").write_text("name: broken\n")
+    (scenes / "broken.yaml").write_text("object: {}\n")
     file.write_text(
         "scene: scenes/cylinder.yaml\n"
         "nodes:\n"

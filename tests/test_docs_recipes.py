@@ -134,6 +134,7 @@ def test_the_launch_files_of_the_node_tutorial_run(tmp_path: Path) -> None:
     (runs / "guard-demo.yaml").write_text(for_demo)
     (runs / "speed_guard.py").write_text(
         python_block("write-your-own-node.md", "class SpeedGuard(")
+        + python_block("write-your-own-node.md", "import asyncio")
     )
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     note, residual = run_script(GUARD_SCRIPT, tmp_path).splitlines()

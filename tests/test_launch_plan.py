@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from flexsheet.launch.plans.documents import BadInputError, did_you_mean, parse_value
+from flexsheet.launch.plans.launch_file import is_scene_file
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.plans.routing import FIRST_PORT, PORT_COUNT, _assign_ports
@@ -362,6 +363,18 @@ def test_a_handler_without_an_input_is_an_error_with_the_similar_name(tmp_path: 
         found := complaint(tmp_path, text)
     )
     assert 'did you mean "on_scene"' in found
+
+
+def test_live_parameters_need_an_input_for_their_changes(tmp_path: Path) -> None:
+    text = GRAPH.replace(f"type: {BEACON}", "type: tests.launch_nodes:UnreachableParameter")
+    assert "declare parameter: Input[ParameterChange] in the class" in complaint(tmp_path, text)
+
+
+def test_only_scenes_are_scene_files(tmp_path: Path) -> None:
+    assert is_scene_file(ROOT / "launch" / "scenes" / "sphere.yaml")
+    assert not is_scene_file(ROOT / "launch" / "demo.yaml")
+    assert not is_scene_file(ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml")
+    assert not is_scene_file(write(tmp_path, "camera: {}\narms: {}\nsheet: {}\n"))
 
 
 @pytest.mark.parametrize(

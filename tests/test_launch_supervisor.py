@@ -139,6 +139,18 @@ async def test_a_ready_node_has_its_real_time_priority_if_the_user_may_set_it(
         assert ("may not set the `nice` or `realtime_priority`" in log) is not granted
 
 
+def test_a_used_port_names_the_options_of_both_nodes() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        settings = [f"twin_arms.left_port={port}", f"arm_left_bridge.port={port}"]
+        plan = load_graph(ROOT / "launch" / "demo.yaml", settings=settings)
+        with pytest.raises(BadInputError) as error:
+            supervisor._check_ports(plan, None)
+    options = "--set twin_arms.left_port=PORT --set arm_left_bridge.port=PORT"
+    assert f"port {port} of 127.0.0.1, for twin_arms, is in use" in str(error.value)
+    assert options in str(error.value)
+
+
 async def test_real_time_is_withdrawn_if_another_node_gets_no_processor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -370,7 +370,7 @@ def report(
 
 @app.command(
     epilog=examples(
-        "flexsheet bag plot session.mcap fingertip.position_m",
+        "flexsheet bag plot session.mcap fingertip.position_world_m",
         "flexsheet bag plot session.mcap arm_left.joints_rad sheet_target.stretch_ratio -o a.svg",
     )
 )
@@ -380,7 +380,8 @@ def plot(
         list[str],
         typer.Argument(
             metavar="TOPIC.FIELD...",
-            help="Numeric fields, such as fingertip.position_m; each field has its own chart.",
+            help="Numeric fields, such as fingertip.position_world_m. Each field has its own "
+            "chart.",
         ),
     ],
     output: Annotated[

@@ -133,13 +133,14 @@ def chart(
     from flexsheet.launch.plans.plan import load_scene
 
     if redraw:
-        results = charts.read_charts(output)
+        stored = charts.read_charts(output)
+        results = [result for result in stored if family in (None, result["family"])]
         if not results:
             raise CommandError(
                 f"--output {output}: the folder contains no results to draw; measure first"
             )
         for result in results:
-            charts.write_chart(result, output)
+            charts.draw_chart(result, output / f"{result['family']}.svg")
         words.print(f"charts: {charts.write_overview(output)}")
         if as_json:
             print_json(results)

@@ -158,6 +158,15 @@ class LaunchFile(StrictModel):
     )
 
 
+def is_scene_file(path: Path) -> bool:
+    """Return whether a YAML file is a scene, and no launch file, calibration or apparatus.
+
+    Raises BadInputError if the file cannot be read.
+    """
+    keys = read_document(path).values.keys()
+    return bool({"object", "working_range"} & keys) and "nodes" not in keys
+
+
 def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     """Read a launch file, and merge it with the files that it extends.
 

@@ -191,6 +191,12 @@ def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
 
 def _connect_ports(entry: NodeEntry, class_: type[Node], document: Document) -> None:
     ports = find_ports(class_)
+    if class_.live_parameters and "parameter" not in ports:
+        document.report(
+            (*entry.key, "type"),
+            f'"{entry.spec.type}" has live_parameters, but no input for their changes',
+            "declare parameter: Input[ParameterChange] in the class",
+        )
     handlers = [f"on_{port.name}" for port in ports.values() if port.direction == "input"]
     for name in find_unmatched_handlers(class_):
         document.report(

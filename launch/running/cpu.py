@@ -21,7 +21,7 @@ MAX_WAIT_RATIO = 0.25
 """The maximum fraction of time that a node can wait for a core on a computer without overload."""
 
 WINDOW_S = 3.0
-BACKGROUND_NICE = 10
+BACKGROUND_NICE = 5
 """The minimum niceness of nodes whose waiting time is ignored.
 
 These nodes are expected to wait.

@@ -35,7 +35,6 @@ from flexsheet.messages.security import KeyChange, KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import (
     ArmState,
-    CpuPressure,
     EStop,
     HostKey,
     HostStatus,
@@ -87,7 +86,7 @@ class HostAgent:
     ) -> None:
         self._plan, self._host, self._run, self._code = plan, host, run, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
-        self._pids, self._cpu = pids, CpuWatch()
+        self._pids, self._cpu, self._starvation = pids, CpuWatch(), CpuWatch()
         self._was_busy, self._busy_reported_ns = False, 0
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
@@ -303,13 +302,18 @@ class HostAgent:
             self._busy_reported_ns = now_ns
             remedy = describe_busy_remedy(nice_denied=status.nice_denied)
             self._on_problem(f"{describe_busy(status)}; {remedy}")
-        self._limit_real_time(status.cpu)
+        self._limit_real_time()
 
-    def _limit_real_time(self, pressure: CpuPressure | None) -> None:
-        """Withdraw the real-time priorities of this graph if another node gets no processor."""
+    def _limit_real_time(self) -> None:
+        """Withdraw the real-time priorities of this graph if another node gets no processor.
+
+        All ready nodes count, also those that normally wait.
+        """
+        pids = self._pids()
+        ready = {one.name for one in self._processes() if one.state == "ready"}
+        pressure = self._starvation.update({name: pids[name] for name in ready & pids.keys()})
         if pressure is None or pressure.wait_ratio < STARVED_WAIT_RATIO:
             return
-        pids = self._pids()
         changed = [name for name in self._real_time & pids.keys() if end_real_time(pids[name])]
         if changed:
             self._on_problem(

@@ -28,7 +28,7 @@ from typing import Any, Self
 
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
-from flexsheet.launch.plans.launch_file import read_launch_file
+from flexsheet.launch.plans.launch_file import is_scene_file, read_launch_file
 from flexsheet.launch.plans.needed_nodes import REASON_TEXTS
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.plans.plan_model import (
@@ -846,7 +846,8 @@ class RunningGraph:
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
             try:
-                write_file(folder / f"{path.stem}.json", load_scene(path).model_dump_json())
+                if is_scene_file(path):
+                    write_file(folder / f"{path.stem}.json", load_scene(path).model_dump_json())
             except BadInputError as error:
                 self._report(LAUNCHER, f"scene {path.name} is skipped: {error}")
 
@@ -986,6 +987,17 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
             )
 
 
+def _name_port_options(plan: ResolvedGraph, port: int) -> str:
+    """Return the options that change a port at the nodes that listen and connect, or ""."""
+    options = [
+        f"--set {node.name}.{name}=PORT"
+        for node in plan.nodes.values()
+        for name, value in node.parameters.items()
+        if value == port and (port in node.listen_ports or node.device_address)
+    ]
+    return f": {' '.join(options)}" if options else ""
+
+
 def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
     """Check that all TCP ports of this launcher's processes are free.
 
@@ -1003,7 +1015,7 @@ def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
             plan.launch_file,
             (),
             f"port {port} of {address}, for {what}, is in use",
-            "stop the other program, or choose another port: --set NODE.PARAMETER=PORT",
+            f"stop the other program, or choose another port{_name_port_options(plan, int(port))}",
         )
         for what, address, port in needed
         if not is_free(address.strip("[]"), int(port))
