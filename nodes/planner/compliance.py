@@ -87,6 +87,7 @@ class UnfitCurveError(FlexsheetError, ValueError):
     """An error for a force curve that is not finite, not ascending, or too short."""
 
     code = "force-curve"
+    phrase = "force curve:"
     remedy = "Give forces at ascending depths, starting with force 0 N at depth 0 m."
 
 
