@@ -563,8 +563,8 @@ def stability(
         bool,
         typer.Option(
             "--graph",
-            help="With --gestures: run the graph, with the hand of the apparatus. By default, the "
-            "gestures run in simulated time.",
+            help="With --gestures: run the graph, with the simulated hand that --apparatus "
+            "describes. By default, the gestures run in simulated time.",
         ),
     ] = False,
     apparatus: options.ApparatusOption = None,
