@@ -684,9 +684,9 @@ def require_projector(scene: Scene) -> Projector:
 
 
 def shows_check_marks(scene: Scene) -> bool:
-    """Return whether the projector projects check marks onto the sheet.
+    """Return whether the projector draws check marks on the sheet.
 
-    The stereo camera uses these marks to check the calibrations.
+    The stereo camera uses these projected marks to check the calibrations.
     """
     return scene.projector is not None and bool(scene.projector.check_marks_sheet_m)
 

@@ -282,7 +282,8 @@ def _unpack(frames: Sequence[Any]) -> Any:
         if len(data) != offset or used >= len(frames):
             raise WireError(
                 "frames",
-                f"the frame with the elements of an array is missing from {len(frames)} frames",
+                f"the header refers to an array in frame {used + 1}, which is missing or invalid; "
+                f"the message has {len(frames)} frames",
             )
         view = _read_only(frames[used])
         if len(view) != size:

@@ -67,7 +67,7 @@ def estimate_median(values: Sequence[float]) -> Interval:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A measurement of one method at one case.
+    """A measurement of one method in one benchmark case.
 
     run: function whose time is measured.
     error: function from the result of `run` to the error in the unit of the method family. The
@@ -102,8 +102,8 @@ class Family:
     trials: function that yields the trials of all methods over a scene's working range. A trial
         must be run before the next trial is requested.
     tolerance: function that returns the scene's tolerance for the error, in `unit`.
-    sweep_key: key of a property of the cases; a separate plot shows the errors against this
-        property. None means that there is no such plot.
+    sweep_key: key of a property of the benchmark cases; a separate plot shows the errors against
+        this property. None means that there is no such plot.
     prepare: function that computes and caches the data for `trials`, and reports its progress.
     """
 
@@ -119,8 +119,8 @@ class Family:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """The measured time and error of one method at one case. The class `Trial` describes further
-    fields.
+    """The measured time and error of one method in one benchmark case. The class `Trial` describes
+    further fields.
 
     params: case and size of the solved problem.
     median_range_s, error_range: limits of the 95 % confidence intervals; None if the value is exact
@@ -184,7 +184,8 @@ def clip_range(end: float, values: Sequence[float]) -> tuple[float, ...]:
 
 
 def pareto_front(points: Sequence[Point]) -> list[str]:
-    """Return the methods that are Pareto-optimal in at least one case of their valid range.
+    """Return the methods that are Pareto-optimal in at least one benchmark case of their valid
+    range.
 
     The methods are sorted by the maximum of their median times.
     """

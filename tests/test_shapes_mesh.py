@@ -394,7 +394,7 @@ def test_refinement_keeps_the_surface() -> None:
     assert volume_m3(fine_vertices, fine) == pytest.approx(0.04**3)
     assert np.isclose(np.abs(fine_vertices).max(axis=1), 0.02).all()
     assert np.isclose(np.degrees(dihedrals_rad(vertices, triangles)[1]).max(), 90.0)
-    with pytest.raises(MeshError, match="increase the edge length"):
+    with pytest.raises(MeshError, match="increase the permitted edge length"):
         refine_facets(vertices, triangles, 1e-5)
 
 

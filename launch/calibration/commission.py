@@ -419,7 +419,7 @@ def _verification_figures(state: State) -> Mapping[str, Any]:
 
 
 def format_verdict(state: State) -> list[str]:
-    """Return lines of text that state whether the laboratory meets all tolerances.
+    """Return lines of text that state whether the display errors are within all tolerances.
 
     If this is in doubt, each reason for doubt follows on a line of its own. If the verification is
     neither finished nor skipped, the result is empty.
@@ -501,16 +501,16 @@ def _split_metric(metric: str) -> tuple[str, str]:
 MOVING = {"sheet_mm": ("delta_d_mm", "true_delta_d_mm"), "fingertip_mm": ("fingertip_mm",)}
 """The metrics that are measured while the finger moves, with the keys of their measured values.
 
-If the result of the stroke contains several of the keys, the last one is used.
+If the result of the finger's stroke contains several of the keys, the last one is used.
 """
 
 
 def _find_measured_errors(figures: Mapping[str, Any]) -> dict[str, float]:
     """Return the measured errors by metric.
 
-    The errors of the sheet and the fingertip are means over the stroke. The other errors are
-    measured at rest. For real devices, the true errors are unknown, and the result contains only
-    the sheet error that the devices report.
+    The errors of the sheet and the fingertip are means over a stroke of the finger. The other
+    errors are measured at rest. For real devices, the true errors are unknown, and the result
+    contains only the sheet error that the devices report.
     """
     stroke = figures.get("stroke", {})
     found = dict(figures.get("at_rest", {}).get("after", {}))
@@ -527,13 +527,13 @@ def list_doubts(
     tracking: tuple[float, float],
     check_command: str,
 ) -> list[str]:
-    """Return the reasons why the errors of a laboratory may exceed a tolerance.
+    """Return the reasons why the display errors in a laboratory may exceed a tolerance.
 
     The list is empty if there are no reasons.
 
     figures: results of the step "verification".
-    tracking: sheet error (mm) that the devices report for the stroke, and the tolerance (mm) of
-        this error.
+    tracking: sheet error (mm) that the devices report for the stroke of the finger, and the
+        tolerance (mm) of this error.
     check_command: command line that repeats the verification.
     """
     doubts = []
@@ -570,7 +570,7 @@ def list_doubts(
 
 
 def _describe_effects(figures: Mapping[str, Any]) -> str:
-    """Return a text in parentheses with the latency and the number of lost messages in the stroke.
+    """Return a text in parentheses: latency and number of lost messages in the finger's stroke.
 
     The text is empty if neither was measured.
     """

@@ -61,9 +61,10 @@ Source: Huber, Robust estimation of a location parameter (1964).
 
 MIN_POSES = 8
 MAX_RESIDUAL_M = 1e-3
-"""A fit is valid if the root mean square (m) of its residuals is at most this value.
+"""The maximum root mean square (m) of the residuals of a valid fit.
 
-Larger residuals indicate that marks, arms or joint angles have been exchanged.
+A larger value indicates that the measurements were assigned to the wrong mark on the clamp, to the
+wrong arm, or to the wrong joint angles.
 """
 
 

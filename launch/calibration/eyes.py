@@ -54,8 +54,8 @@ Source: Huber, Robust estimation of a location parameter (1964).
 MAX_ANGLE_RAD = 0.02
 """The maximum rms angle (rad) between bead and cross, as seen from the fitted eye.
 
-A larger angle indicates that the eyes, or the bead and the cross, have been exchanged in the CSV
-file.
+A larger angle indicates that the left and the right eye, or the bead and the cross, were confused
+in the CSV file.
 """
 
 MAX_SHIFT_M = 0.3
@@ -170,8 +170,9 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
     crosses = np.array([one.cross_m for one in alignments])
     if np.linalg.norm(beads - crosses, axis=1).min() < MIN_DISTANCE_M:
         raise EyesError(
-            f"a bead is less than {1e3 * MIN_DISTANCE_M:.0f} mm from its cross; hold the bead "
-            "closer to the viewer"
+            f"{alignments[0].eye} eye: in one alignment, the bead is less than "
+            f"{1e3 * MIN_DISTANCE_M:.0f} mm from the projected cross; hold the bead closer to the "
+            "eye"
         )
 
     def offsets(eye: Floats) -> Floats:

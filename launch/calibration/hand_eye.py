@@ -57,7 +57,7 @@ Some subsets then contain no wrong poses, even if a few poses are wrong.
 """
 
 LENGTH_M = 0.3
-"""The translation (m) that counts as much as a rotation of one radian in the error of a pose."""
+"""The translation (m) that has the same weight as a rotation of 1 rad in the error of a pose."""
 
 MAX_MEDIAN_RATIO = 6.0
 """A pose is excluded from the first fit if its error exceeds this multiple of the median error."""

@@ -1,4 +1,4 @@
-"""Predict the errors of a calibrated laboratory from the uncertainties of its calibrations.
+"""Predict the display errors in a calibrated laboratory from the uncertainties of the calibrations.
 
 The prediction is a Monte Carlo simulation. It samples apparatuses, which are sets of possible true
 parameters of the devices. The true parameters deviate at random from the calibrated parameters in
@@ -139,13 +139,14 @@ class Knowledge:
 
 
 def predict_errors(known: Knowledge, tracking_m: float) -> dict[Metric, PredictedError]:
-    """Predict the errors of a calibrated laboratory.
+    """Predict the errors of sheet, image, force and fingertip in a calibrated laboratory.
 
     The errors of sheet and fingertip apply to a stroke of the finger at the working speed of the
     scene. The errors of image and force apply to a finger at rest.
 
     tracking_m: mean tracking error of the sheet that the devices report during a stroke. It is
-        independent of the calibration errors. Therefore, the squares of both errors are added.
+        independent of the sheet error that the calibrations cause. Therefore, the squares of these
+        two errors are added.
     """
     random = np.random.default_rng(DRAW_SEED)
     scene = known.scene
@@ -303,7 +304,7 @@ def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
 
 
 def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Random) -> Apparatus:
-    """Return the apparatus with a random hysteresis that is consistent with the calibration.
+    """Return the true hardware parameters with a random hysteresis that fits the calibration.
 
     The calibration measures how much smaller the force is during unloading than during loading at
     the same depth. Creep causes a part of this difference. The hysteresis is chosen to cause the

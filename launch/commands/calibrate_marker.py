@@ -51,7 +51,11 @@ def marker(
     apparatus: options.TwinApparatusOption = None,
     calibration_file: Annotated[
         Path | None,
-        typer.Option("--calibration", help="With --twin: stereo calibration of the camera."),
+        typer.Option(
+            "--calibration",
+            help="With --twin: stereo calibration file with which the marker's positions are "
+            "computed from simulated images. Default: the camera parameters of the scene.",
+        ),
     ] = None,
     seed: options.SeedOption = 1,
     as_json: options.JsonOption = False,

@@ -77,7 +77,7 @@ def simulate_views(
 ) -> Iterator[Views]:
     """Yield simulated image pairs of a calibration board, one pair for each random pose.
 
-    If an apparatus is given, the images have the errors of its camera.
+    If an apparatus (true hardware parameters) is given, the images have the errors of its camera.
     """
     from flexsheet.nodes.twin.board import TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera

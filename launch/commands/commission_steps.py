@@ -144,7 +144,7 @@ class Laboratory:
     data: for each step, the file or folder with the captured data.
     finger_radius_m: measured radius of the fingertip, for real devices.
     sheet_kg_per_m2: measured mass per area of a real sheet.
-    seconds: duration of the stroke in the verification.
+    seconds: duration of the finger's stroke in the verification.
     simulated_time: whether to verify simulated devices in simulated time, without a running graph.
     pairs, arm_poses, sheet_poses: numbers of simulated image pairs, arm poses and sheet poses.
     """
@@ -557,7 +557,7 @@ class Laboratory:
         )
 
     def verify(self, lab: Commissioning) -> StepResult:
-        """Measure the errors during a stroke and, for simulated devices, the errors at rest."""
+        """Measure the errors during a stroke of the finger and, for simulated devices, at rest."""
         from flexsheet.launch.bags.report.findings import BRIEFLY_BUSY_FRACTION
         from flexsheet.launch.calibration.prediction import predict_errors
 
@@ -635,9 +635,9 @@ def collect_knowledge(lab: Commissioning) -> Knowledge:
 def run_verification(
     lab: Commissioning, seconds: float, seed: int, *, simulated_time: bool
 ) -> dict[str, Any]:
-    """Measure the true errors of a simulated laboratory, both during a stroke and at rest.
+    """Measure the true display errors in a simulated laboratory, for a moving and a resting finger.
 
-    seconds: duration of the stroke.
+    seconds: duration of the stroke of the finger.
     simulated_time: whether to run the stroke in simulated time, without a graph. If true, the
         self-checks and the errors before calibration are omitted.
 

@@ -45,7 +45,7 @@ def demo(
     output: options.ResultFolderOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Simulate strokes, a tilted sheet and a pushed sheet, and draw charts of the errors.
+    """Simulate finger strokes, a tilted sheet and a pushed sheet, and draw charts of the errors.
 
     The result of each experiment is printed and saved when the experiment is finished.
     """

@@ -488,7 +488,7 @@ def print_followed(results: list[dict[str, Any]]) -> None:
 
 
 def print_strokes(results: list[dict[str, Any]]) -> None:
-    """Print the mean and standard deviation of the stroke errors, and the values of the paper.
+    """Print mean and standard deviation of the errors in finger strokes, and the paper's values.
 
     The paper is Furukawa et al. 2007, Table I.
     """
@@ -510,7 +510,7 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
 
 def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print the mean errors of each variant over all strokes.
+    """Print the mean errors of each variant over all strokes of the finger.
 
     The 95 % confidence interval of each mean is also printed.
     """
@@ -563,8 +563,8 @@ def stability(
         bool,
         typer.Option(
             "--graph",
-            help="With --gestures: run the graph, with the hand of the apparatus. By default, the "
-            "gestures run in simulated time.",
+            help="With --gestures: run the graph, with the simulated hand that --apparatus "
+            "describes. By default, the gestures run in simulated time.",
         ),
     ] = False,
     apparatus: options.ApparatusOption = None,

@@ -70,9 +70,9 @@ def robustness(
     """Measure the errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
     For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
-    separate process runs a graph with one stroke. The errors of image and force are computed with
-    the sheet at rest, without a graph. To continue an interrupted command, repeat it with the same
-    --output.
+    separate process runs a graph with one stroke of the finger. The errors of image and force are
+    computed with the sheet at rest, without a graph. To continue an interrupted command, repeat it
+    with the same --output.
     """
     from flexsheet.launch.experiments import robustness as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile
@@ -120,8 +120,8 @@ def robustness(
 def _print_predictions(found: dict[str, Any]) -> None:
     """Print how often predictions and true errors agree that the hardware is within tolerance.
 
-    The table counts the four combinations of both results. The first row is for whole reports, and
-    each further row is for one metric.
+    The table counts the four combinations of prediction and true errors. The first row is for whole
+    reports, and each further row is for one metric.
     """
     cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
     every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}
@@ -164,8 +164,8 @@ def sensitivity(
     """Measure the errors that each hardware parameter causes if only this parameter is inaccurate.
 
     Each parameter deviates by 1 and 3 standard deviations in both directions. Delays and tremor are
-    evaluated by strokes in simulated time. All other parameters are evaluated with the sheet at
-    rest. To continue an interrupted command, repeat it with the same --output.
+    evaluated by strokes of the finger in simulated time. All other parameters are evaluated with
+    the sheet at rest. To continue an interrupted command, repeat it with the same --output.
     """
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment

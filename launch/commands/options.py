@@ -116,8 +116,8 @@ TwinApparatusOption = Annotated[
         "--apparatus",
         metavar="FILE|seed:N",
         help="With --twin: file with the true parameters of the simulated hardware, or a random "
-        "sample such as seed:7. Default: the parameters of the scene; for arms and projector, "
-        "random deviations from the scene, which --seed determines.",
+        "sample such as seed:7. By default, the hardware has the parameters of the scene, but "
+        "`calibrate arms` and `calibrate projector` add random deviations (see --seed).",
     ),
 ]
 RunOption = Annotated[

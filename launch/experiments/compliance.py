@@ -104,13 +104,14 @@ class RestInterval:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """The finger path of one push.
+    """One push of the finger at a position on the object.
 
     place: name of the pushed position.
     place_m: distance (m) along the object, and arc length (m) around the object from its front.
     surface, normal: point (3,) and normal (3,) of the undeformed object at this position, in the
         world frame.
-    holds: evaluated intervals; empty if the finger does not rest.
+    holds: intervals in which the finger rests and the force is evaluated; empty if the finger moves
+        in and out without resting.
     """
 
     path: FingerPath

@@ -49,7 +49,7 @@ of image correction that are compared.
 class DemoResult:
     """The results of all finished experiments of the demo.
 
-    strokes: one result per stroke.
+    strokes: one result per stroke of the finger.
     followed: errors of the sheet along the given finger path; None if no path was given.
     """
 
@@ -109,7 +109,7 @@ def make_demo_procedures(
 
 
 def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
-    """Evaluate the recorded strokes, and return the result of the last stroke.
+    """Evaluate the recorded strokes of the finger, and return the result of the last stroke.
 
     strokes: durations of the strokes up to now, s. Returns None if the bag does not yet contain the
     last stroke. The results of all strokes are written to a file and drawn.
@@ -152,7 +152,7 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
 
 
 def evaluate_images(bag: Path, count: int) -> DemoResult | None:
-    """Draw the images of the simulated eye in the first `count` cases of IMAGES.
+    """Draw the images of the simulated eye in the first `count` simulated cases of IMAGES.
 
     Returns None if the bag does not yet contain the images of all these cases.
     """

@@ -95,7 +95,7 @@ PROGRESS_PERIOD_S = 5.0
 
 @dataclass(slots=True)
 class Waiter:
-    """A wait for a condition, whose deadline frames of the renderer can postpone.
+    """A wait for a condition until a deadline, which frames from the renderer can postpone.
 
     seconds: time (s) to wait after the start, and after each frame that postpones the deadline.
     latest_s: latest deadline, in the time of the event loop.

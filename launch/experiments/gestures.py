@@ -55,7 +55,7 @@ GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
 }
 """The functions that make the finger paths of gestures, with the names of the gestures as keys.
 
-The gestures are the strokes of Furukawa et al. 2007, and models of human motions.
+The gestures are the finger strokes of Furukawa et al. 2007, and models of human motions.
 """
 
 

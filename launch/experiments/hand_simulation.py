@@ -88,13 +88,13 @@ class Motion:
 
     @property
     def decays(self) -> NDArray[np.bool_]:
-        """Return a mask that is True for the cases in which no oscillation is sustained."""
+        """Return a mask that is True for simulated cases in which no oscillation is sustained."""
         died_out = self.amplitude_m <= MAX_AMPLITUDE_M
         return np.asarray(died_out | (self.decay_per_s >= SLOWEST_DECAY_PER_S))
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Return a mask that is True for the stable cases.
+        """Return a mask that is True for the stable simulated cases.
 
         A case is stable if its oscillation decays and the sheet delivers no energy.
         """
@@ -136,8 +136,9 @@ class HeldOffset:
         self._columns = np.arange(len(cases))
 
     def sample(self, step: int, depths_m: Floats) -> None:
-        """Measure the finger depths (n,), in m, of the n cases, and queue the sheet offsets
-        computed from them.
+        """Measure the finger depth (n,), in m, in each of the n simulated cases.
+
+        The sheet offsets that are computed from the measured depths are queued.
 
         step: number of the time step.
         """
@@ -157,9 +158,9 @@ class HeldOffset:
         self._queued[rows, 1, self._columns] = rate
 
     def advance(self, step: int) -> Floats:
-        """Return the sheet's offsets (n,), in m, of the n cases at a time step.
+        """Return the sheet's offset (n,), in m, along its normal in each of the n simulated cases.
 
-        Call the method for all time steps in increasing order.
+        step: number of the time step. Call the method for all time steps in increasing order.
         """
         row = step % self._ring
         due = self._due[row] & (self._sampled[row] > self._newest)

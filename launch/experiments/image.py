@@ -1,9 +1,9 @@
 """Measure the size errors of the image on an inclined sheet and on a pushed sheet.
 
 These are the experiments of Furukawa et al. 2007, section VI, Figs. 11 and 13. A correction is a
-method that corrects the image for the sheet's shape. A case combines an angle or a depth with a
-correction. The label of the case is stored in the renderer's frames and in the simulated eye's
-images. The results are computed from the eye's images in the bag.
+method that corrects the image for the sheet's shape. A simulated case combines an angle or a depth
+with a correction. The label of the case is stored in the renderer's frames and in the simulated
+eye's images. The results are computed from the eye's images in the bag.
 """
 
 from __future__ import annotations
@@ -140,14 +140,12 @@ They are used to measure the image error at all visible points.
 
 
 def make_pattern_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the image that shows a pattern in the case `label`."""
+    """Return the label of the image that shows a pattern in the simulated case `label`."""
     return f"{label}, {pattern}"
 
 
 def make_eyes_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the images that show a pattern in the case `label`, with one image per
-    eye.
-    """
+    """Return the label of the images, one per eye, of a pattern in the simulated case `label`."""
     return f"{make_pattern_label(label, pattern)}, both eyes"
 
 
@@ -195,13 +193,13 @@ def size_errors_mm(
 
 
 def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
-    """Compute the image errors at all visible points of a case, from the images of both `RAMPS`."""
+    """Compute the image errors at all visible points in a simulated case, from both `RAMPS`."""
     x, y = (find_recorded(images, "image", make_pattern_label(label, pattern)) for pattern in RAMPS)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
 def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, ErrorMap]:
-    """Compute the image errors at all visible points of a case, for the left and the right eye."""
+    """Compute the image errors at all visible points in a simulated case, for each eye."""
 
     def errors_of(viewpoint: Viewpoint) -> ErrorMap:
         x, y = (

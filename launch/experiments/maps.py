@@ -1,4 +1,4 @@
-"""Draw maps of the image error at all visible points, by case and correction method."""
+"""Draw maps of the image error at all visible points, by simulated case and correction method."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CROSS_MAGNIFICATION = 20.0
 def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> None:
     """Draw error maps with one row per value of the series and one column per correction method.
 
-    Raises ExperimentError if an image of a case is missing.
+    Raises ExperimentError if an image of a simulated case is missing.
     """
     cases = [
         (series.name.format(value), [series.label(value, name) for name in CORRECTIONS])

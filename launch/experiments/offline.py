@@ -103,12 +103,12 @@ distances (m) to the right.
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """The errors of one apparatus; a field is None if it was not evaluated.
+    """The errors with given true hardware parameters; a field is None if it was not evaluated.
 
     fingertip_m: (n, 3), measured minus true fingertip position at n contact points.
     sheet_m: (n, 3), point of the object under the true finger minus the contact point of the sheet.
-    image_m: one map (rows, columns, 2) of image errors per case; NaN if the object is not visible
-        at a pixel.
+    image_m: one map (rows, columns, 2) of image errors per simulated case; NaN if the object is not
+        visible at a pixel.
     felt_n, expected_n: (k,), k forces of the true sheet, and the forces that the planner's model of
         the sheet predicts for the same pushes.
     """
@@ -133,7 +133,7 @@ class Evaluation:
         }
 
     def change_from(self, other: Evaluation) -> dict[str, float | None]:
-        """Return, for each metric, the mean difference from another evaluation of the same cases.
+        """Return each metric's mean difference from another evaluation of the same simulated cases.
 
         Errors of single vectors, pixels and pushes are subtracted before averaging. Therefore
         errors common to both evaluations cancel. The units are those of `figures`.
@@ -268,7 +268,7 @@ class OfflineEvaluator:
         metrics: frozenset[Metric] = ALL_METRICS,
         speed_m_per_s: float = 0.0,
     ) -> Evaluation:
-        """Evaluate the given metrics of an apparatus.
+        """Evaluate the given metrics with an apparatus (true parameters of the simulated hardware).
 
         speed_m_per_s: speed of the finger along the object. The speed affects only the errors of
         fingertip and sheet.

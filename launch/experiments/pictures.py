@@ -36,8 +36,9 @@ CORRECTION_NAMES = {
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw the eye's image for each image correction, and the expected image, with one row per
-    case.
+    """Draw the eye's image for each image correction, and the expected image.
+
+    Each row of the figure shows one simulated case.
     """
     columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
@@ -77,7 +78,7 @@ def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | No
 
 
 def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
-    """Draw position and angle errors against time, with one column per stroke.
+    """Draw position and angle errors against time, with one column per stroke of the finger.
 
     The mean error of the same stroke in Furukawa et al. 2007 is included.
     """

@@ -47,7 +47,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def apparatus_text(seed: int, profile: Profile, *, calibrated: bool) -> str:
-    """Return the value of the command-line option --apparatus that selects a random apparatus."""
+    """Return the value of the option --apparatus that selects random true hardware parameters."""
     return f"seed:{seed},{profile.value}{',calibrated' if calibrated else ''}"
 
 
@@ -70,7 +70,8 @@ def run_robustness(
 
     commissioned: whether each simulated laboratory is calibrated first, in a separate folder. Then
         it is evaluated in simulated time with the resulting scene and launch file. The apparatus
-        has the errors of uncalibrated hardware, and the calibrated camera defines the world frame.
+        (true hardware parameters) has the errors of uncalibrated hardware, and the calibrated
+        camera defines the world frame.
     """
     if commissioned and calibrated:
         raise ExperimentError(
@@ -133,7 +134,7 @@ def run_robustness(
 
 
 def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
-    """Compare the errors that the laboratories' reports predict with the true errors.
+    """Compare the errors that reports of simulated laboratories predict with the true errors.
 
     confusion: number of laboratories for each combination of report (good or not) and true errors
         (within tolerance or not), in total and for each metric.
@@ -183,7 +184,7 @@ def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
-    """Count the cases by their combination of two flags: (reported as good, truly good)."""
+    """Count the simulated laboratories by two flags: (reported as good, truly good)."""
     return {
         "good_and_within": cases.count((True, True)),
         "good_but_exceeded": cases.count((True, False)),

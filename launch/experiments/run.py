@@ -168,7 +168,7 @@ def make_stroke_procedure(
 ) -> Procedure:
     """Make a procedure that moves the finger along strokes, or along a given path.
 
-    seconds: durations of the strokes, s.
+    seconds: durations of the finger's strokes, s.
     path: finger path that replaces the strokes.
     """
 
@@ -211,7 +211,7 @@ def make_image_procedure(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> Procedure:
-    """Make a procedure that captures an image of each case (value and correction method).
+    """Make a procedure that captures an image of each simulated case (value and correction method).
 
     with_maps: whether to take images of coordinate ramps, from which the errors at all visible
         points are computed.

@@ -32,7 +32,8 @@ class EvaluationKind(StrEnum):
 
     OFFLINE: no motion is simulated. The errors of sheet and fingertip are evaluated at the working
         speed, and the errors of image and force at rest.
-    SIMULATED_TIME: the errors of sheet and fingertip are evaluated in strokes in simulated time.
+    SIMULATED_TIME: the errors of sheet and fingertip are evaluated during strokes of the finger in
+        simulated time.
     NOT_MEASURED: the parameter affects only images of a moving sheet or eye.
     NOT_SIMULATED: no simulator node uses the parameter.
     """
@@ -68,7 +69,9 @@ TIMING = frozenset(
 """The parameters that have no effect at rest, or no effect on a noise-free image of the marker."""
 
 STROKE_SEEDS = (0, 1, 2)
-"""The random seeds of the strokes, which the nominal and the changed apparatus share."""
+"""The random seeds of the finger's strokes. The simulations with nominal and with changed hardware
+parameters use the same seeds.
+"""
 
 WITH_IMAGES = frozenset({"finger.marker_shape", "finger.marker_tilt_rad"})
 """The parameters that affect the detection of the marker, which requires rendered images."""
@@ -82,8 +85,8 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
 }
-"""The sections of the apparatus, with the metrics that the parameters of each section affect at
-rest.
+"""The sections of the apparatus (true hardware parameters), with the metrics that the parameters of
+each section affect at rest.
 """
 
 
@@ -112,8 +115,8 @@ def run_sensitivity(
 ) -> dict[str, Any]:
     """Vary the parameters individually, and return the results of `experiment sensitivity --json`.
 
-    folder: folder in which the results of finished trials are stored. seconds: duration of a
-    stroke.
+    folder: folder in which the results of finished trials are stored. seconds: duration of a stroke
+    of the finger.
     """
     plan = load_graph(launch_file, settings=settings)
     scene = require_scene(plan)
@@ -172,7 +175,7 @@ def _make_row(
     The effect on a metric is None if the metric was not evaluated.
 
     At rest, an effect is the mean change of single vectors, pixels and pushes. In simulated time,
-    an effect is the mean error minus the mean error with the nominal apparatus.
+    an effect is the mean error minus the mean error with the nominal hardware parameters.
 
     sigma: size of the deviation, in standard deviations.
     """

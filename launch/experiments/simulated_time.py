@@ -81,14 +81,15 @@ CYCLE_S = 0.0071
 READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
 """The durations (s) of camera read-out, computation and transmission, which are successive.
 
-The read-out duration applies unless the apparatus defines it. The computation ends when the target
-is published. The transmission ends when an arm command uses the target.
+The read-out duration applies unless the true hardware parameters (the apparatus) define it. The
+computation ends when the target is published. The transmission ends when an arm command uses the
+target.
 """
 
 PIXEL_NOISE_PX = 0.02
 PREDICTION_S = 0.12
 SERVO_LAG_S = 0.025
-"""The servo lag (s) of simulated arms if the apparatus does not define it."""
+"""The servo lag (s) of simulated arms if the true hardware parameters do not define it."""
 
 MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
 """The maximum measured servo lag, and the maximum extrapolation time of a target, in seconds.
@@ -563,10 +564,12 @@ def record_in_simulated_time(
 def stroke_in_simulated_time(
     scene: Scene, apparatus: Apparatus, settings: LoopSettings, seconds: float
 ) -> dict[str, dict[str, float]]:
-    """Simulate the experiment `stroke`, and return its errors in mm and degrees.
+    """Simulate the experiment `stroke` (one finger stroke); return its errors in mm and degrees.
 
     Keys with the prefix `true_` contain true errors. The same keys without the prefix contain the
-    errors that the devices measure. `settings.calibrations` must not be None.
+    errors that the devices measure.
+
+    `settings.calibrations` must not be None.
     """
     recorded = record_in_simulated_time(
         scene, apparatus, settings, stroke_path(scene, seconds), stroke_window_s(seconds)

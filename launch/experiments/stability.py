@@ -126,7 +126,7 @@ class Trial:
 
 
 def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
-    """Return the simulation cases of all combinations of trials and gains.
+    """Return the simulated cases of all combinations of trials and gains.
 
     The cases of one trial are consecutive.
     """
@@ -332,7 +332,11 @@ def stability_result(
     settings: StabilitySettings,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Run both simulations, and return the result of `flexsheet experiment stability --json`."""
+    """Simulate hands on the sheet; return the result of `flexsheet experiment stability --json`.
+
+    The first simulation measures the critical slope above which a hand is not stable. The second
+    simulation tests whether hands are stable with objects of several stiffnesses.
+    """
     boundary = measure_boundary(settings, progress)
     rows = measure_map(scene, model, curve, settings, progress)
     errors = np.abs([row["error_percent"] for row in boundary])

@@ -55,7 +55,7 @@ PAPER_TABLE_1 = {
     10.0: {"delta_d_mm": (0.443, 0.0330), "delta_theta_deg": (0.359, 0.267)},
     30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
 }
-"""The errors in Table I of Furukawa et al. 2007; the keys are durations of strokes (s).
+"""The errors in Table I of Furukawa et al. 2007; the keys are durations of finger strokes (s).
 
 Each value is a mean and a standard deviation.
 """
@@ -289,7 +289,7 @@ def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, in
 
 
 def read_recording(bag: Path) -> StrokeRecording:
-    """Read the data of a stroke from a bag; raise ExperimentError if data are missing."""
+    """Read the data of a finger stroke from a bag; raise ExperimentError if data are missing."""
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     fingertip: list[tuple[int, Floats]] = []
@@ -578,7 +578,7 @@ class StrokeErrors:
 
 
 def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
-    """Return the start and end time (ns) of the stroke with a duration of `seconds`.
+    """Return the start and end time (ns) of the finger stroke with a duration of `seconds`.
 
     Raises ExperimentError if the recording does not contain this stroke.
     """
@@ -589,7 +589,7 @@ def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int
 
 
 def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
-    """Compute the errors at each exposure of the stroke with a duration of `seconds`.
+    """Compute the errors at each exposure of the finger stroke with a duration of `seconds`.
 
     Raises ExperimentError if the recording does not contain this stroke.
     """
@@ -727,8 +727,9 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
 
 
 def compute_busy_fraction(recording: StrokeRecording, seconds: float) -> float | None:
-    """Return the fraction of load reports during a stroke that state an overload, or None if there
-    are no reports.
+    """Return the fraction of load reports in a finger stroke that state an overload.
+
+    Return None if there are no reports.
     """
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
     busy = [one for at_ns, one in recording.loads if begin_ns <= at_ns <= finish_ns]
@@ -738,7 +739,7 @@ def compute_busy_fraction(recording: StrokeRecording, seconds: float) -> float |
 def stroke_result(
     recording: StrokeRecording, errors: StrokeErrors, seconds: float, bag: Path
 ) -> dict[str, Any]:
-    """Return the results of one stroke for `experiment stroke --json`, in mm, degrees and ms.
+    """Return one finger stroke's results for `experiment stroke --json`, in mm, degrees and ms.
 
     lag_ms: lag of the true sheet behind the true finger, estimated by cross-correlation.
     """

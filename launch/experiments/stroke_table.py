@@ -24,7 +24,7 @@ from flexsheet.messages.methods import TrackingMethod
 from flexsheet.messages.scene import Scene, require_cylinder
 
 FIRST_SEED = 4100
-"""The random seed of the noise of finger and camera in the first stroke.
+"""The random seed of the noise of finger and camera in the first stroke of the finger.
 
 Charts and defaults use other seeds.
 """
@@ -132,7 +132,7 @@ def run_stroke_table(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Run several strokes of each variant with different seeds; return the results for JSON.
+    """Run several finger strokes per variant with different seeds; return the results for JSON.
 
     seconds: duration of a stroke. repeats: number of strokes per variant.
     """
@@ -183,7 +183,7 @@ def _trial_name(variant: Variant, number: int) -> str:
 
 
 def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
-    """Summarize the errors, latencies and lost messages of repeated strokes.
+    """Summarize the errors, latencies and lost messages of repeated finger strokes.
 
     The result also contains the number of strokes and the errors of failed strokes. The errors are
     summarized as in `summarize_means`.
@@ -206,7 +206,7 @@ def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def summarize_means(strokes: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Summarize the errors of repeated strokes.
+    """Summarize the errors of repeated finger strokes.
 
     mean: mean of the strokes' mean errors.
     std: mean of the strokes' standard deviations.

@@ -3,7 +3,7 @@
 A trial is a process that prints its result, a row, as JSON. A sweep's folder has `sweep.json` with
 its settings and one JSON file per trial. Trials whose row exists are not run again. Trials run on
 this computer or on the workers of a `dask.distributed` scheduler. The workers must find the launch
-file and the apparatus files under the same paths.
+file and the apparatus files (true hardware parameters) under the same paths.
 """
 
 from __future__ import annotations

@@ -58,15 +58,17 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 STROKE = "system stroke"
 TOUCH_M = 0.001
-"""The push depth (m) during the stroke, which keeps the finger in contact despite drift and
-tremor."""
+"""The push depth (m) during the stroke of the finger, which keeps the finger in contact despite
+drift and tremor."""
 
 STROKED_RATIO = 0.9
 """The stroked part of the arc length that the finger can touch, as a fraction."""
 
 SAMPLE_S = 0.05
 MAX_STEP_RAD = 0.1
-"""The maximum phase difference of the oscillating stroke between two points of its path, in rad."""
+"""The maximum phase difference of the oscillating finger stroke between two points of its path, in
+rad.
+"""
 
 APPROACH_S = 1.0
 WARM_UP_S = 0.5

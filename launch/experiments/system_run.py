@@ -54,7 +54,7 @@ def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
 def run_system(
     launch_file: Path, settings: Sequence[str], bag: Path, seconds: float, progress: Progress
 ) -> dict[str, Any]:
-    """Run the graph during a stroke of `seconds`; return its processor use and latencies (ms).
+    """Run the graph during a finger stroke of `seconds`; return processor use and latencies (ms).
 
     A latency is None if the graph does not have the corresponding output.
     """
@@ -80,7 +80,7 @@ def run_system(
 
 
 def read_window_ns(bag: Path) -> tuple[int, int]:
-    """Return the start and the end (ns) of the stroke in a bag."""
+    """Return the start and the end (ns) of the finger stroke in a bag."""
     window = 0, 0
     for _, message, header, _ in BagReader(bag, topics=["twin/finger"]):
         if isinstance(message, TwinFinger) and message.path_label == STROKE:
@@ -89,7 +89,7 @@ def read_window_ns(bag: Path) -> tuple[int, int]:
 
 
 def evaluate_stroke(bag: Path) -> dict[str, Any]:
-    """Compute latencies, errors and lost messages of the recorded stroke of a running graph.
+    """Compute latencies, errors and lost messages of the finger stroke that a bag contains.
 
     Latencies have quantiles p50, p95 and p99. Errors of sheet and fingertip have mean, p95 and max.
     """

@@ -58,9 +58,12 @@ def _tell(text: str) -> None:
 
 
 def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
-    """Run one stroke in a separate graph, and return its results and the suspected error causes.
+    """Simulate one stroke of the finger in a separate graph.
 
-    trial: description of the trial. apparatus: value of the option --apparatus.
+    Return the measured errors and latencies, and the error causes that the nodes suspected.
+
+    trial: description of the trial. apparatus: value of the option --apparatus, which selects the
+    true parameters of the simulated hardware.
     """
     launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
     settings = [*choose_ports(launch_file), *trial.get("settings", ())]
@@ -86,12 +89,15 @@ def read_flags(bag: Path) -> list[SuspectedCause]:
 
 
 def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
-    """Run one stroke with the apparatus that the trial names, and return its results."""
+    """Simulate one stroke of the finger, and return the measured errors and latencies.
+
+    The trial selects the true parameters of the simulated hardware (the apparatus).
+    """
     return run_stroke(trial, trial.get("apparatus"))
 
 
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the errors of the system with a random apparatus.
+    """Return the display errors with random true parameters of the simulated hardware.
 
     The errors of the sheet are measured in motion, and the errors of image and force at rest.
     """
@@ -128,7 +134,7 @@ def _join_figures(moving: Row, resting: Mapping[str, float | None]) -> Row:
 
 
 def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
-    """Commission a simulated laboratory, and return its errors.
+    """Commission (calibrate and verify) a simulated laboratory; return the errors of its display.
 
     The verification runs in simulated time, without a graph. Its result also contains the predicted
     errors, and whether the laboratory's own report rates the result as good.
@@ -176,12 +182,12 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the changes of the errors that deviations of one apparatus parameter cause.
+    """Return the changes of the display errors that deviations of one hardware parameter cause.
 
     No graph is run.
 
-    The errors are measured in strokes in simulated time if the trial has `stroke_seeds`, and at
-    rest otherwise.
+    If the trial has `stroke_seeds`, the errors are measured during strokes of the finger in
+    simulated time. Otherwise, they are measured at rest.
     """
     plan = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
     scene, calibrations = require_scene(plan), NodeCalibrations.of(plan)
@@ -221,7 +227,7 @@ def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
 def _mean_stroke_errors(
     scene: Scene, apparatus: Apparatus, calibrations: NodeCalibrations, trial: Mapping[str, Any]
 ) -> dict[Metric, float]:
-    """Return the mean errors (mm) of sheet and fingertip over strokes in simulated time."""
+    """Return mean errors (mm) of sheet and fingertip over finger strokes in simulated time."""
     strokes = [
         stroke_in_simulated_time(
             scene,
@@ -248,7 +254,7 @@ def run_system_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_system_errors_trial(trial: Mapping[str, Any]) -> Row:
-    """Compute the errors of several configurations with one apparatus, in simulated time."""
+    """Compute the errors of several configurations with the same simulated hardware parameters."""
     plan = load_graph(Path(trial["launch_file"]), apparatus=trial["apparatus"])
     scene = require_scene(plan)
     apparatus = plan.apparatus_message() or nominal_apparatus(scene)

@@ -37,7 +37,7 @@ RESTING = ("hold",)
 def make_finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
     """Return the true finger motions of the tracking benchmark, by name.
 
-    The motions are human gestures and, if the object is a cylinder, a stroke.
+    The motions are human gestures and, if the object is a cylinder, a stroke of the finger.
     """
     paths: dict[str, FingerPath] = {}
     if isinstance(scene.object.geometry, Cylinder):

@@ -49,7 +49,9 @@ NOMINAL = "errors-nominal"
 """The name of the trial that computes errors with hardware that does not deviate from the scene."""
 
 FIRST_SEED = 100
-"""The seed of the first random apparatus; smaller seeds are reserved for development."""
+"""The seed of the first random set of true hardware parameters; smaller seeds are reserved for
+development.
+"""
 
 ORDER_SEED = 19
 FINGER_SEED = 5200
@@ -85,11 +87,13 @@ class SceneTrials:
 def describe_errors(
     launch: Path, configurations: Sequence[Configuration], apparatus: str | None, seconds: float
 ) -> dict[str, Any]:
-    """Return the description of a trial that computes errors of configurations with one apparatus.
+    """Return the specification of a trial that computes display errors of several configurations.
 
-    apparatus: text that describes the true hardware parameters. If None, the hardware does not
-        deviate from the scene.
-    seconds: duration of the stroke.
+    All configurations use the same true parameters of the simulated hardware (the apparatus).
+
+    apparatus: value of the option --apparatus. If it is None, the hardware does not deviate from
+        the scene.
+    seconds: duration of the finger's stroke around the object.
     """
     return {
         "kind": "system errors",
@@ -116,7 +120,7 @@ def plan_trials(
     order.
 
     blocks: number of blocks.
-    seconds: duration of each stroke.
+    seconds: duration of each stroke of the finger.
     apparatuses: number of random apparatuses (sets of true hardware parameters).
     """
     scene = load_scene(scene_file)
@@ -202,7 +206,7 @@ def run_system_chart(
     """Measure the configurations for all scenes, and return the result of `chart system --json`.
 
     blocks: number of repetitions per scene.
-    seconds: duration of each stroke.
+    seconds: duration of each stroke of the finger.
     apparatuses: number of random apparatuses (sets of true hardware parameters).
     """
     points: list[dict[str, Any]] = []

@@ -44,7 +44,10 @@ PROFILES = tuple(one.value for one in Profile)
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """The specification of a random apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
+    """The specification of a random apparatus (true parameters of the simulated hardware).
+
+    It is parsed from `seed:N[,modern|paper][,calibrated]`.
+    """
 
     seed: int
     profile: Profile
@@ -73,7 +76,7 @@ def parse_draw(text: str) -> Draw | None:
 
 
 def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> Apparatus:
-    """Read an apparatus from a file, or sample a random apparatus from a text such as "seed:7".
+    """Read true hardware parameters from a file, or sample them from a text such as "seed:7".
 
     scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
         sampled relative to the scene before commissioning, in the world frame of the camera.
@@ -136,7 +139,7 @@ def _compare_scenes(apparatus: Apparatus, scene: Scene, document: Document) -> l
 
 
 def format_apparatus(apparatus: Apparatus) -> str:
-    """Return an apparatus as the YAML text of an apparatus file."""
+    """Return true hardware parameters as the YAML text of an apparatus file."""
     yaml = YAML()
     yaml.default_flow_style = None
     yaml.width = 4096
@@ -154,7 +157,7 @@ def give_apparatus(
     apparatus: Apparatus | None,
     document: Document,
 ) -> None:
-    """Set the apparatus as a parameter of all simulator nodes.
+    """Set the apparatus (true hardware parameters) as a parameter of all simulator nodes.
 
     Problems are stored in `document`. For example, a launch file must not contain an apparatus.
     """

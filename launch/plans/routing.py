@@ -38,7 +38,8 @@ def list_writers(
 
     A topic that has more writers than allowed is reported to `document`.
 
-    has_scene, has_apparatus: whether the launcher publishes a scene and an apparatus.
+    has_scene, has_apparatus: whether the launcher publishes a scene, and an apparatus (true
+    parameters of simulated hardware).
     """
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))

@@ -48,7 +48,7 @@ INPUTS = {
                           RosTopic("/external/fingertip", "geometry_msgs/msg/PointStamped", False),
                           "point of the finger's pad that touches the sheet"),
 }  # fmt: skip
-"""The ROS inputs that can be accepted, by the flexsheet topic on which they are published."""
+"""The supported ROS inputs. Each key is the flexsheet topic on which the input is published."""
 
 
 @dataclass(slots=True)

@@ -42,7 +42,11 @@ class ToolCounts:
 
 
 def tools_host(run: Run) -> str:
-    """Return the name of the host on which the command-line tools of a run are used."""
+    """Return the name that this computer has in a run's launch file.
+
+    It is the host whose nodes the run started, or `MAIN` if the run started the nodes of all hosts.
+    Command-line tools use the keys and the permissions of this host.
+    """
     return run.host or MAIN
 
 

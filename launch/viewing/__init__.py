@@ -1,1 +1,1 @@
-"""Export models of the apparatus to other tools, and serve a running graph to viewers."""
+"""Export models of the arms and the sheet to other tools, and serve a running graph to viewers."""

@@ -53,7 +53,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A rigid part of the apparatus, represented by boxes."""
+    """A rigid part of the haptic display, represented by boxes."""
 
     name: str
     boxes: tuple[Box, ...] = ()
@@ -96,7 +96,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class ApparatusModel:
-    """The links and joints of the apparatus. Parent links precede their child links."""
+    """The links and joints of the haptic display. Parent links precede their child links."""
 
     name: str
     links: tuple[Link, ...]

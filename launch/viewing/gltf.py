@@ -1,4 +1,4 @@
-"""Write the model of the apparatus as glTF 2.0, for 3D viewers and modelling programs.
+"""Write the model of the haptic display as glTF 2.0, for 3D viewers and modelling programs.
 
 Each joint and each link is a glTF node of the same name. The node of a joint contains the nodes of
 all following links, and its `extras` contain the axis and the range of the joint. As is usual in

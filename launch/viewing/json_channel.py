@@ -89,7 +89,8 @@ def _merge(schemas: list[JsonSchema]) -> JsonSchema:
     """Return one JSON Schema for values of several types.
 
     If all types have the same schema, this schema is returned. If all types are objects, the result
-    has the fields of all objects. Otherwise, the result is the schema of an array or a text.
+    has the fields of all objects. Otherwise, the result is the schema of an array if one of the
+    types is an array, and the schema of a text if no type is an array.
     """
     if not schemas:
         return _TEXT

@@ -93,7 +93,7 @@ class Pace(Enum):
 
 @dataclass(slots=True)
 class LiveState:
-    """The latest message of each topic, and the model of the apparatus in the latest scene."""
+    """The latest message of each topic, and the model of the haptic display in the latest scene."""
 
     latest: dict[str, Message] = field(default_factory=dict)
     model: ApparatusModel | None = None

@@ -1,4 +1,4 @@
-"""Write the model of the apparatus as URDF, for RViz, Foxglove, MuJoCo and other tools."""
+"""Write the model of the haptic display as URDF, for RViz, Foxglove, MuJoCo and other tools."""
 
 from __future__ import annotations
 

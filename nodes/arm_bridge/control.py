@@ -219,7 +219,7 @@ class ArmControl:
 
     @property
     def path_blocked(self) -> bool:
-        """Return whether the arm rests because the path to the target violates a limit."""
+        """Return whether the arm rests because no permitted path to the target was found."""
         return self._blocked is not None and self._state in CHECKING_STATES
 
     @property

@@ -28,8 +28,9 @@ from flexsheet.nodes.models.sheet import flange_pose, sheet_from_edges
 RANGE_MARGIN_RAD = np.radians(2.0)
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
-"""The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
-The margins are necessary because servos vibrate slightly and measurements are noisy."""
+"""The margins (m and rad) by which a limit of the sheet or the flanges is widened if it is exceeded
+at the start of a motion. The margins are necessary because servos vibrate slightly and measurements
+are noisy."""
 
 EDGE_SPEED_FRACTION = 0.95
 """The fraction of the maximum tool speed that the sheet's edges may use."""

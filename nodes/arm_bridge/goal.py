@@ -49,7 +49,7 @@ MAX_TRAJECTORY_S = 0.4
 """The maximum duration (s) of a trajectory that an arm follows even if no new message arrives."""
 
 SKEW_LENGTH_M = 0.25
-"""The offset (m) between two sheet poses that counts as much as a rotation of 1 rad."""
+"""The offset (m) between two sheet poses that has the same weight as a rotation of 1 rad."""
 
 
 @dataclass(frozen=True, slots=True)

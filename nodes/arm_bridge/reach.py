@@ -260,8 +260,9 @@ class PathStep:
 class PathError(FlexsheetError, ValueError):
     """An error for a path that the arms cannot follow.
 
-    limit: a member of `LIMITS`, "jump" or "alignment".
-    fraction: position on the path, 0 to 1.
+    limit: violated limit: a member of `LIMITS`, "jump" if joint angles would be discontinuous, or
+        "alignment" if the arms cannot move to the path.
+    fraction: position of the violation on the path, from 0 (start) to 1 (end).
     """
 
     code = "path"

@@ -1,4 +1,4 @@
-"""Store the latencies of the last half minute for the chart on the page."""
+"""Store the latencies of the last 30 s for the latency chart of the console page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "fra
 
 
 class History:
-    """The history of the latencies from the camera exposure to each processing step, in ms."""
+    """The latencies (ms) of the last 30 s, from the camera exposure to each processing step."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()

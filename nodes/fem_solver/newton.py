@@ -106,7 +106,10 @@ class FingerObstacle:
         self.parents, self._local = _find_parents(elements, faces)
 
     def points(self, positions: Floats) -> Floats:
-        """Return the contact points (q, 3) for node positions (n, 3), m."""
+        """Return the positions (q, 3), m, of the q contact points on the body's surface.
+
+        positions (n, 3): positions of the mesh nodes, m.
+        """
         result: Floats = (self._shape @ positions[self._faces]).reshape(-1, 3)
         return result
 

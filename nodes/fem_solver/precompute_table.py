@@ -56,7 +56,7 @@ T = TypeVar("T")
 VERSION = 5
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""The number of progress steps that one snapshot counts, and the number that one table node counts.
+"""The progress steps that are added for each finished snapshot, and for each finished table node.
 """
 POLL_S = 0.2
 """The period of progress reports and stop checks while snapshots are solved, in seconds."""

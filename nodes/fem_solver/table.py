@@ -229,12 +229,16 @@ def compute_force_factors(
 ) -> Floats:
     """Return the factors (L,) that correct the forces of a table at the L depths (L,), m.
 
-    The meshes of the table are too coarse for small contacts. Therefore the forces in the table are
-    too large. Each factor is an estimate of the true force divided by the force in the table at the
-    same point. fine: sample point and snapshot of a push on a fine mesh. The estimate is a
-    Richardson extrapolation of order 2 from the table's mesh and the fine mesh. At depths where the
-    table contains the linear response, the estimate is the force on the fine mesh. Beyond the
-    maximum depth of the push on the fine mesh, the factor is constant.
+    The meshes of the table are too coarse for small contacts, so its forces are too large. Each
+    factor is an estimate of the true force divided by the force in the table at the same point. If
+    the table contains only the nonlinear response at a depth, the true force is estimated by
+    Richardson extrapolation of order 2 from the table's mesh and a fine mesh. At smaller depths,
+    the force on the fine mesh is the estimate. Beyond the maximum depth that was solved on the fine
+    mesh, the factor is constant.
+
+    fine: sample point of a push, and the snapshot (solution) of this push on the fine mesh.
+    response, linear: response of the skin, and linear model of the soft body.
+    interpolator: interpolator of the snapshots on the table's mesh.
     """
     sample, push = fine
     solved_m = push.depths_m[: push.reached]

@@ -43,7 +43,8 @@ MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
 speed."""
 
 MAX_TILT_RAD = 1.4
-"""The maximum tilt of the sheet in any scene. Two normals within this tilt are never opposite."""
+"""The maximum angle (rad) between the sheet's normal and the direction to the user in any scene. It
+is less than pi / 2, so two permitted normals are never opposite."""
 
 RIM_RADIUS_M = 0.03
 """The radius around the contact in which a finger deforms the sheet."""
@@ -112,9 +113,9 @@ class ContactStateMachine:
         if first.normal @ limits.front < np.cos(max_tilt_rad):
             lean_deg = np.degrees(np.arccos(first.normal @ limits.front))
             raise UnpresentableError(
-                f"the object's front is tilted by {lean_deg:.0f} degrees from the user, but the "
-                f"sheet can tilt by {np.degrees(max_tilt_rad):.0f} degrees only; rotate the object "
-                "by object.world_from_object in the scene"
+                f"the object's front faces {lean_deg:.0f} degrees away from the user, but the "
+                f"sheet can tilt by at most {np.degrees(max_tilt_rad):.0f} degrees; rotate the "
+                "object: change object.world_from_object in the scene"
             )
         self.contact = make_tangent_contact(home, first, limits.half_width_m)
         self._in_contact = False

@@ -26,8 +26,8 @@ from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 
 EDGE_SPEED_FRACTION = 0.7
-"""The fraction of the maximum tool speed that the planner uses. The rest is reserved for an arm
-that is late and must catch up."""
+"""The fraction of the maximum tool speed that the planner uses. The remaining speed is reserved for
+an arm that is late and must catch up."""
 
 EDGE_MARGIN_M = 0.03
 """The minimum distance of a contact from a clamp, so the finger cannot touch the clamp."""

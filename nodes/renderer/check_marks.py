@@ -56,7 +56,7 @@ NO_MARKS = CheckMarks(0, np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros(
 def place_marks(
     projector: Projector, world_from_sheet: Floats, mesh: SheetMesh, deeper: SheetMesh | None
 ) -> CheckMarks:
-    """Compute the check marks of a projector on the sheet.
+    """Compute the check marks that a projector draws on the sheet to check the calibrations.
 
     world_from_sheet (4, 4): pose of the sheet. mesh: current mesh of the sheet. deeper: mesh of the
     sheet if the fingertip were `FINGER_STEP_M` deeper; None if there is no contact.

@@ -137,8 +137,8 @@ def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
     """Estimate the fraction, from 0 to 1, of the sheet's visible area that is dark due to folds.
 
     A triangle gets no light if it faces away from the projector, or if the projector sees it
-    edge-on. The area of a dark triangle counts twice, because the triangle casts a shadow of about
-    the same area on the sheet. eye, projector (3,): positions, world frame, m.
+    edge-on. The estimate contains the area of a dark triangle twice, because the triangle casts a
+    shadow of about the same area on the sheet. eye, projector (3,): positions, world frame, m.
     """
     # One array for each coordinate is several times faster than an array of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)

@@ -41,9 +41,10 @@ ACCELERATION_DECAY_PER_S = 6.0
 acceleration for long."""
 
 MAX_OSCILLATOR_WIDTH_HZ = 2.0
-"""The maximum half-power bandwidth of an oscillator. It covers the spectral peak of a tremor, and
-changes of the tremor's frequency. Slow oscillators model voluntary motion around one point, with a
-damping ratio of one half."""
+"""The maximum half-power bandwidth (Hz) of the oscillator in a motion model of the finger. It
+covers the spectral peak of a tremor, and changes of the tremor's frequency. At low frequencies, a
+damping ratio of 0.5 sets a smaller bandwidth. Oscillators of low frequency model voluntary motion
+around one point."""
 
 SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
 """The prediction horizons (s) at which the prediction errors are measured to compute the weights.

@@ -1,10 +1,11 @@
 """Check whether two ellipses show one flat round marker, and correct their centres.
 
 Perspective shifts the centre of an ellipse. The image of a disc with radius R and normal n
-satisfies A A^T = R^2 J (I - n n^T) J^T. A is the matrix of the ellipse's edge (module `ellipse`),
-and J is the derivative of the pixel with respect to the point. Each ellipse permits two normals,
-mirrored about the line of sight. The other view determines the correct normal. If a marker is
-partly covered, or merged with a bright spot, usually no normal agrees with both views.
+satisfies A A^T = R^2 J (I - n n^T) J^T. The matrix A (2, 2) maps the unit circle to the ellipse's
+edge (module `ellipse`). The matrix J (2, 3) is the derivative of the disc centre's pixel
+coordinates with respect to its position. Each ellipse permits two normals, mirrored about the line
+of sight. The image of the other camera determines the correct normal. If a marker is partly
+covered, or merged with a bright spot, usually no normal agrees with both views.
 """
 
 from __future__ import annotations

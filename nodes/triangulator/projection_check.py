@@ -86,7 +86,7 @@ class ProjectionCheck:
         self._latency = ResidualMonitor(1, threshold=LATENCY_THRESHOLD_S, memory_s=LATENCY_MEMORY_S)
 
     def on_frame(self, frame: Frame) -> None:
-        """Store the expected positions of the marks in a displayed frame."""
+        """Store the expected positions of the projected check marks in a displayed frame."""
         if frame.light_ns and self._count and len(frame.marks_world_m) == self._count:
             normal = frame.world_from_sheet[:3, 2]
             expected = (frame.light_ns, frame.marks_world_m, frame.marks_finger_ratio, normal)
@@ -94,11 +94,11 @@ class ProjectionCheck:
 
     @property
     def expected_world_m(self) -> Floats:
-        """Return the newest expected world positions (n, 3), m, of the marks."""
+        """Return the newest expected world positions (n, 3), m, of the projected check marks."""
         return self._frames[-1][1] if self._frames else np.zeros((0, 3))
 
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
-        """Compare the bright points (3,), m, of an image pair with the expected marks.
+        """Compare bright points (3,), m, of an image pair with the expected projected check marks.
 
         camera_shift_m: displacement (3,) by which an error of the camera's pose shifts the measured
             positions of the fixed reference marks.

@@ -52,8 +52,8 @@ class CameraCheck:
     reference_marks: world positions (n, 3), m, of fixed marks that look like the finger's marker.
     touch_point: world position (3,), m, of a known point that the finger can touch; None if no
         point is known.
-    projector: projector of the scene, which may project check marks on the sheet; None if the scene
-        has no projector.
+    projector: projector of the scene, which can draw marks on the sheet to check the calibrations;
+        None if the scene has no projector.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class CameraCheck:
         self._resting: deque[tuple[int, Floats]] = deque()
 
     def on_frame(self, frame: Frame) -> None:
-        """Store the expected positions of the check marks that a frame contains."""
+        """Store the expected positions of the projected check marks in a frame."""
         self._projection.on_frame(frame)
 
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:

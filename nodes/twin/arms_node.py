@@ -39,7 +39,10 @@ Loopback = Annotated[str, AfterValidator(check_loopback)]
 
 
 class TwinArmsParameters(SimulatorParameters):
-    """The parameters of the simulated arms. Values in the parameter `apparatus` take precedence."""
+    """The parameters of the simulated arms.
+
+    Values in the parameter `apparatus` (true hardware parameters) take precedence.
+    """
 
     host: Loopback = "127.0.0.1"
     left_port: ListenPort = Field(

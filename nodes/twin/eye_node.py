@@ -189,7 +189,7 @@ class TwinEyeNode(Node):
         """Return the true world position (3,), m, of the virtual camera at the time `at_s`.
 
         The tracked eyes are used. If no eyes are tracked, the eyes in the scene are used. The
-        offset in the parameter `apparatus` is added.
+        offset in the parameter `apparatus` (true hardware parameters) is added.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

@@ -248,7 +248,7 @@ class TwinFingerNode(Node):
         position.
 
         The actual exposure time differs from `middle_ns` by the timestamp error in the parameter
-        `apparatus`. A scene must have arrived before the call.
+        `apparatus` (true hardware parameters). A scene must have arrived before the call.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()

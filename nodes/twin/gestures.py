@@ -219,15 +219,16 @@ def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _arc_run(scene: Scene) -> tuple[float, float]:
-    """Return half the arc length (m) and the speed (m/s) of a stroke around the surface."""
+    """Return half the arc length (m) and the speed (m/s) of a stroke of the finger."""
     half = 0.5 * touchable(scene)[1]
     return half, min(scene.working_range.speed_m_per_s, half / 0.3)
 
 
 def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Stroke around the surface, and stop suddenly in the middle and at the end of each stroke.
+    """Move the finger in strokes around the surface, with sudden stops.
 
-    There are three strokes in each direction.
+    The finger stops in the middle and at the end of each stroke. There are three strokes in each
+    direction.
     """
     half, speed = _arc_run(scene)
     start_s, lag_s = 0.2, np.random.default_rng(seed).uniform(0.3, 0.6, 12)
@@ -241,7 +242,7 @@ def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Stroke back and forth around the surface, and reverse suddenly at random times."""
+    """Move the finger back and forth around the surface, and reverse suddenly at random times."""
     half, speed = _arc_run(scene)
     generator = np.random.default_rng(seed)
     turn_s = 2.0 * BRAKE_S
@@ -259,7 +260,7 @@ def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Stroke around the surface while the depth oscillates at 0.7 Hz.
+    """Move the finger around the surface while its depth oscillates at 0.7 Hz.
 
     The maximum depth is a tenth of `push_depth_m` of the scene's working range.
     """

@@ -79,7 +79,10 @@ class LitMarks:
             self._solving.exception()
 
     def on_frame(self, frame: Frame) -> None:
-        """Store the check marks of a frame. The projector shows them until the next frame."""
+        """Store the projected check marks of a frame.
+
+        The simulated projector shows them until the next frame is displayed.
+        """
         if frame.light_ns and len(frame.marks_px):
             late_ns = round(1e9 * find_display_delay_s(frame, self._apparatus))
             self._frames.append((frame.light_ns + late_ns, frame.marks_px))

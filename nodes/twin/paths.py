@@ -80,7 +80,7 @@ class SurfaceMap:
         if front.normal @ towards_user < most:
             raise FingerPathError(
                 f'scene "{scene.name}": no side of the object faces the user within '
-                "working_range.tilt_rad; rotate the object by object.world_from_object"
+                "working_range.tilt_rad; rotate the object: change object.world_from_object"
             )
         along = np.array([1.0, 0.0, 0.0])
         across = np.cross(front.normal, along)
@@ -113,7 +113,7 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the maximum length (m) of a stroke in one direction.
+        """Return the maximum length (m) of a stroke of the finger in one direction.
 
         The stroke starts at the front of the object and follows the geodesic in the direction
         `heading` (3,). It ends at an edge of the object, or at the maximum angle between the
@@ -140,7 +140,7 @@ class SurfaceMap:
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
         """Fit splines to the surface as functions of `along` and `arc`.
 
-        The splines cover 1.25 times the range of strokes.
+        The splines cover 1.25 times the range of the finger's strokes.
         """
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
@@ -294,7 +294,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
     3. Translate: the median x, y is placed in front of the centre of the object.
     4. Project: z becomes the height above the surface. The deepest 30 % of the samples push into
         the surface, limited smoothly to a sixth of `push_depth_m`. y becomes arc length on the
-        surface, so a vertical motion strokes the surface.
+        surface, so a vertical motion of the finger strokes the surface.
     5. Slow down, if necessary, by one factor, to 0.8 of the scene's finger speed.
 
     The samples are limited to the scene's finger volume and joined by a spline, which preserves the

@@ -36,11 +36,12 @@ STRETCH_MARGIN = 0.005
 
 @dataclass(frozen=True, slots=True)
 class SheetPlanes:
-    """The planes of the sheet at n times.
+    """The planes through the clamped edges of the sheet, or tangent to the sheet, at n times.
 
-    points (n, 3): points on the planes, m. They are midway between the clamped edges if the planes
-        contain the edges.
-    normals, x_axes (n, 3): unit vectors.
+    points (n, 3): a point on each plane, m. In a plane through the edges, it is midway between
+        them.
+    normals (n, 3): unit normals of the planes.
+    x_axes (n, 3): unit vectors from the left to the right clamped edge.
     distances_m (n,): distances between the clamped edges.
     """
 

@@ -148,9 +148,10 @@ def _normal_cdf(sigmas: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """A row of the tolerance table: the distribution of one parameter of the apparatus.
+    """A row of the tolerance table: the distribution of one parameter of the simulated hardware.
 
-    key: dotted path in the apparatus; "*" stands for both arms or both lenses.
+    key: dotted path in the apparatus (set of true parameters); "*" stands for both arms or both
+        lenses.
     unit, scale: unit in tables, and the factor from SI units to this unit.
     modern: distribution of every component, or a tuple with one distribution per component.
     source, calibrated_source: literature or data sheet from which the numbers are taken.
@@ -339,8 +340,8 @@ NOT_SIMULATED: dict[str, str] = {
     "finger.hand_damping_ratio": _ONLY_COUPLED,
     "finger.hand_stiffness_n_per_m": _ONLY_COUPLED,
 }
-"""The keys of an apparatus that have no effect in the launch files of this package, with the reason
-for each key."""
+"""The keys of an apparatus (true hardware parameters) that have no effect in the launch files of
+this package, with the reason for each key."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:
@@ -458,7 +459,7 @@ TRUTH_SECTIONS = ("camera", "arms", "sheet", "finger", "gauge", "eyes", "project
 
 
 def list_differences(apparatus: Apparatus) -> list[tuple[str, Any, Any, str]]:
-    """List the parameters of an apparatus that differ from the nominal values.
+    """List the true hardware parameters (the apparatus) that differ from the nominal values.
 
     An entry is (path, value, nominal value, unit), with values in the unit of the tolerance table.
     """

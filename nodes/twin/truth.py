@@ -48,7 +48,7 @@ def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> fl
     """Return the delay (s) of a frame's true display after the time that the renderer assumes.
 
     The frame contains the latency that the renderer assumes. If no frame has been displayed, the
-    nominal latency is used. The result is 0 if there is no apparatus.
+    nominal latency is used. The result is 0 if there is no apparatus (true hardware parameters).
     """
     if apparatus is None:
         return 0.0
@@ -234,7 +234,7 @@ def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
 
 
 def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:
-    """List the values of an apparatus that are impossible in its scene.
+    """List the true hardware parameters (the apparatus) that are impossible in their scene.
 
     An entry is (key, value, problem, remedy).
     """

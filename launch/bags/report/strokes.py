@@ -3,8 +3,8 @@
 The errors are defined in `launch.experiments.stroke`. They are computed in blocks, so the required
 memory does not depend on the duration of the bag. If the planner lowers the sheet to render
 compliance, the errors are relative to the object's surface lowered by the commanded
-`normal_offset_m`. For the strokes of an experiment, the errors are relative to the surface itself,
-as in the paper.
+`normal_offset_m`. For strokes of the finger in an experiment, the errors are relative to the
+surface itself, as in the paper.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ class FingerRun:
     zero_ns: start time of the path.
     done_ns: time of the last exposure on the path.
     end_ns: time of the last exposure at which the finger reports the path.
-    stroke_s: duration of the stroke; None if the path is not a stroke of an experiment.
+    stroke_s: duration of the stroke of the finger; None if the path is not a stroke of an
+        experiment.
     sums: errors during the stroke, relative to the measured finger and to the true finger.
     """
 
@@ -83,7 +84,7 @@ class FingerRun:
 
     @property
     def stroke_window_ns(self) -> tuple[int, int]:
-        """Return the start and the end time (ns) of the stroke.
+        """Return the start and the end time (ns) of the stroke of the finger.
 
         If the path is not a stroke of an experiment, both times are equal.
         """

@@ -50,12 +50,15 @@ def make_lattice(half_cells: tuple[int, int, int]) -> tuple[Ints, Ints]:
 def bisect(
     vertices: Ints, tetrahedra: Ints, too_large: Callable[[Ints, Ints], Bools]
 ) -> tuple[Ints, Ints]:
-    """Bisect tetrahedra (e, 4) until none of them is too large.
+    """Bisect tetrahedra (e, 4) until none of them is too large, and return the refined mesh.
 
-    too_large: function that returns whether each tetrahedron is too large, for given vertices (n,
-    3) and tetrahedra. Adjacent tetrahedra are also bisected, because neighbours must share whole
-    faces. Raises UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra or edges shorter than 1/64
-    of a cell are required.
+    Adjacent tetrahedra are also bisected, because neighbours must share whole faces.
+
+    vertices (n, 3): integer coordinates. too_large: function that returns, for given vertices and
+    tetrahedra, whether each tetrahedron is too large.
+
+    Raises UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra are required, or edges shorter
+    than 1/64 of a cell of the initial lattice.
     """
     while True:
         if len(tetrahedra) > MAX_TETRAHEDRA:

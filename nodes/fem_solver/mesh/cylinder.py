@@ -328,8 +328,8 @@ def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[
 
     points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the s cross-sections, m.
     The diagonals alternate between slices, so that the mesh has no preferred direction. swapped:
-    index of the first slice whose two ends are exchanged before it is divided. From there on, the
-    ends of every second slice are exchanged.
+    index of a slice that is divided as if its two ends were swapped. Every second slice before and
+    after it is divided in the same direction.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])

@@ -285,7 +285,10 @@ _IDENTITY = np.eye(3)
 
 Triple = tuple[float, float, float]
 LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[float]], float]]
-"""A variant of `LevelSet` that is evaluated at a single point and uses Python numbers."""
+"""A function like `LevelSet` for a single point, with Python numbers for speed.
+
+The function returns the value, the gradient (3,), the Hessian (3, 3) and the support.
+"""
 
 
 def descend_one(

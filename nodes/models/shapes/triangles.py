@@ -279,8 +279,8 @@ def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tup
         if len(triangles) > MAX_TRIANGLES:
             raise MeshError(
                 f"the mesh has edges of up to {length.max():.3g} m; dividing them to at most "
-                f"{longest_m:.3g} m needs more than {MAX_TRIANGLES} triangles; increase the edge "
-                "length (smoothing_m of a mesh in a scene)"
+                f"{longest_m:.3g} m needs more than {MAX_TRIANGLES} triangles; increase the "
+                "permitted edge length (smoothing_m of the mesh in a scene) or use a smaller object"
             )
 
 

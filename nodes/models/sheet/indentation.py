@@ -152,7 +152,7 @@ class IndentationCase:
 
 
 IndentationOffsets = Iterable[Floats]
-"""The displacements of each case, in the order of the cases.
+"""The displacements of each solved push (`IndentationCase`), in the order of the pushes.
 
 The arrays have the shape (depths, rows, columns, 3) and the unit m. Rows and columns are those of
 the grid on the sheet."""
@@ -170,7 +170,7 @@ def solve_indentation_basis(
     """Compute the shape of the membrane for pushes at all interpolation nodes, and reduce the
     shapes to modes.
 
-    solve_all: function that solves the cases in this process or in other processes. On one core,
+    solve_all: function that solves the pushes in this process or in other processes. On one core,
         this takes 45 s.
 
     Raises NoEquilibriumError if a solution does not converge.
