@@ -156,9 +156,15 @@ def test_a_method_out_of_its_range_is_not_accepted_even_if_the_graph_is_exact() 
     assert any("range" in line for line in found.explain())
 
 
-def test_a_cheaper_configuration_is_tried_if_the_prediction_was_too_large() -> None:
-    """The worst cases of both force models add up to 22 percent; the graph has a third of it."""
-    limits = {**LIMITS, FORCE_ERROR: 10.0}
+@pytest.mark.parametrize(("tolerance", "methods"), [(13.0, ["table", "linear"]), (11.0, ["table"])])
+def test_a_cheaper_configuration_is_tried_if_the_prediction_was_too_large(
+    tolerance: float, methods: list[str]
+) -> None:
+    """The worst cases of both force models add up to 17 percent; the graph has a third of it.
+
+    The graph cannot disprove a worst case of 12 percent that alone exceeds the tolerance.
+    """
+    limits = {**LIMITS, FORCE_ERROR: tolerance}
     ran: list[str] = []
 
     def run_graph(combination: Combination) -> Figures:
@@ -167,16 +173,16 @@ def test_a_cheaper_configuration_is_tried_if_the_prediction_was_too_large() -> N
         return predicted | {FORCE_ERROR: predicted[FORCE_ERROR] / 3.0}
 
     found = compose(STAGES, limits, run_graph, margin=0.2)
-    assert ran == ["table", "linear"]
+    assert ran == methods
     assert found.accepted
-    assert found.chosen["sheet-force"].method == "linear"
+    assert found.chosen["sheet-force"].method == methods[-1]
 
 
 def test_a_metric_that_the_graph_does_not_measure_has_its_predicted_value() -> None:
     skin = SystemMetric.SKIN
     stages = {
         "soft-body": [
-            StageOption("coarse", 0.01, biases={FORCE_ERROR: 12.0, skin: 0.4}),
+            StageOption("coarse", 0.01, biases={FORCE_ERROR: 9.0, skin: 0.4}),
             StageOption("fine", 0.05, biases={FORCE_ERROR: 3.0, skin: 0.2}),
         ]
     }

@@ -302,7 +302,8 @@ def compose(
     cheapest combination is run whose predicted metrics meet the tolerances with the margin. If this
     combination exceeds a tolerance in the run, all predictions are corrected, and the next
     combination is run. This ends if no other combination is predicted to be better in the exceeded
-    metrics. Finally, if the predicted errors were too large, cheaper combinations are run.
+    metrics. Finally, if the predicted errors were too large, cheaper combinations are run, unless
+    the error of one of their methods alone exceeds a tolerance.
 
     If no combination can meet a tolerance, a combination is chosen that is near the smallest
     attainable value.
@@ -347,7 +348,8 @@ def compose(
             break
     best = _find_best(runs, tolerances)
     while len(runs) < MAX_RUNS:
-        cheaper = _find_cheaper(combinations, tried, runs[best], tolerances, margin)
+        candidates = [one for one in combinations if not _adds_miss(one, tried[best], tolerances)]
+        cheaper = _find_cheaper(candidates, tried, runs[best], tolerances, margin)
         if cheaper is None:
             break
         run(cheaper)
@@ -398,6 +400,22 @@ def _find_cheaper(
         if one not in tried and not excess(expected, limits):
             return one
     return None
+
+
+def _adds_miss(one: Combination, best: Combination, tolerances: Figures) -> bool:
+    """Return whether a method of a combination alone exceeds a tolerance, unlike the best one's.
+
+    A run of the graph does not contain all cases of the working range, so it cannot disprove this.
+    """
+    return any(
+        _own_error(option, metric) > limit >= _own_error(best[stage], metric)
+        for stage, option in one.items()
+        for metric, limit in tolerances.items()
+    )
+
+
+def _own_error(option: StageOption, metric: SystemMetric) -> float:
+    return option.spreads.get(metric, 0.0) + abs(option.biases.get(metric, 0.0))
 
 
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
