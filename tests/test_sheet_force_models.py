@@ -24,7 +24,11 @@ from flexsheet.nodes.models.sheet.force_models import (
     interpolate_inverse,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
-from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
+from flexsheet.nodes.models.sheet.tabulated import (
+    MAX_CURVES,
+    TabulatedSheetModel,
+    make_tabulated_model,
+)
 
 Floats = NDArray[np.float64]
 
@@ -229,6 +233,22 @@ def test_a_table_returns_its_entries_and_interpolates_by_the_law() -> None:
     ):
         assert table.invalid_reason(SheetPush(stretch, RADIUS, place), depth)
         assert np.isfinite(force(table, stretch, depth, place))
+
+
+def test_stored_curves_do_not_change_the_force_and_are_limited() -> None:
+    axis, ratios = np.array([1.02, 1.08]), np.array([[1.0, 1.2], [1.1, 1.4]])
+    depths, one = np.array([0.002, 0.05]), np.array([0.0])
+
+    def make() -> TabulatedSheetModel:
+        return TabulatedSheetModel(
+            ScaledSheetModel(RUBBER), axis, depths, one, one, ratios.reshape(2, 2, 1, 1)
+        )
+
+    table = make()
+    for stretch in np.linspace(1.02, 1.08, MAX_CURVES + 10).tolist():
+        for _ in range(2):
+            assert force(table, stretch, 0.02) == force(make(), stretch, 0.02)
+        assert len(table._curves) <= MAX_CURVES
 
 
 def test_a_table_of_one_entry_is_a_factor() -> None:

@@ -9,7 +9,7 @@ used for other radii.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
@@ -26,6 +26,13 @@ from flexsheet.nodes.models.sheet.rubber import Rubber
 Measure = Callable[[float, Floats, SheetPosition], Floats]
 """A function that returns forces (n,), N. Its arguments are a stretch ratio, n depths (n,), m, and
 a position."""
+
+
+Curve = Callable[[Floats], Floats]
+"""A function of n depths (n,), m."""
+
+MAX_CURVES = 256
+"""The maximum number of stored curves. A planner uses some tens: the same pushes for every fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +54,9 @@ class TabulatedSheetModel:
     ys_m: Floats
     ratios: Floats
     name: str = "table"
+    _curves: dict[SheetPush, tuple[Curve, Curve]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         axes = (self.stretches, self.depths_m, self.xs_m, self.ys_m)
@@ -68,22 +78,35 @@ class TabulatedSheetModel:
 
     def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
         base = self.base.evaluate(push, depths_m)
-        x, y = map(abs, push.position_m)
-        ratios = _interpolate_linear(self.stretches, push.stretch_ratio, self.ratios)
-        ratios = _interpolate_linear(self.xs_m, x, np.moveaxis(ratios, 1, 0))
-        ratios = _interpolate_linear(self.ys_m, y, np.moveaxis(ratios, 1, 0))
         if len(self.depths_m) == 1:
-            ratio, slope = np.full(base.force_n.shape, ratios[0]), np.zeros(1)
+            ratio = np.full(base.force_n.shape, self._ratios_of(push)[0])
+            slope = np.zeros(1)
         else:
-            curve = scipy.interpolate.PchipInterpolator(self.depths_m, ratios)
+            curve, derivative = self._ratio_curve(push)
             within = np.clip(depths_m, self.depths_m[0], self.depths_m[-1])
             ratio = curve(within)
-            slope = np.where(within == depths_m, curve(within, 1), 0.0)
+            slope = np.where(within == depths_m, derivative(within), 0.0)
         return SheetForce(
             base.force_n * ratio,
             base.stiffness_n_per_m * ratio + base.force_n * slope,
             base.edge_force_n,
         )
+
+    def _ratios_of(self, push: SheetPush) -> Floats:
+        """Return the ratios (b,) at the depths of the table."""
+        x, y = map(abs, push.position_m)
+        ratios = _interpolate_linear(self.stretches, push.stretch_ratio, self.ratios)
+        ratios = _interpolate_linear(self.xs_m, x, np.moveaxis(ratios, 1, 0))
+        return _interpolate_linear(self.ys_m, y, np.moveaxis(ratios, 1, 0))
+
+    def _ratio_curve(self, push: SheetPush) -> tuple[Curve, Curve]:
+        """Return the ratio as a function of the depth, and its derivative."""
+        if push not in self._curves:
+            if len(self._curves) >= MAX_CURVES:
+                self._curves.clear()
+            curve = scipy.interpolate.PchipInterpolator(self.depths_m, self._ratios_of(push))
+            self._curves[push] = curve, curve.derivative()
+        return self._curves[push]
 
     def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
         x, y = map(abs, push.position_m)
