@@ -80,7 +80,7 @@ async def test_a_finger_meets_the_objects_force_by_the_twins_sheet(
         float(object_force_n(np.array(depth_m), scale)), rel=TARGET_ERROR_RATIO
     )
     assert pull_n < SCENE.sheet.max_edge_force_n
-    assert desk.planner.note == "sheet force model: scaled"
+    assert desk.planner.note == "sheet force model: table"
 
 
 async def test_what_is_published_as_retreat_is_where_the_sheet_comes_to_rest() -> None:

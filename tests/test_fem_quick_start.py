@@ -120,7 +120,7 @@ def test_mirror_images_of_contact_nodes_have_the_mirrored_skin() -> None:
 
 
 def test_the_shipped_pushes_of_the_demo_are_current() -> None:
-    """If this test fails, run `python -m benchmarks.ship_pushes`."""
+    """If this test fails, run `python -m benchmarks.ship_tables`."""
     scene = load_scene(LAUNCH / "scenes" / "cylinder.yaml")
     choice = scene.methods.soft_body
     assert choice is not None

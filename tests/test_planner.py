@@ -491,7 +491,7 @@ async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> 
     sheet = SCENE.sheet
     force = edge_force_n(target.stretch_ratio, sheet)
     assert push_stiffness_n_per_m(force, width_m=sheet.width_m) == pytest.approx(45.0, rel=1e-6)
-    assert desk.planner.note == "sheet force model: scaled"
+    assert desk.planner.note == "sheet force model: table"
 
 
 @pytest.mark.parametrize(("stiffness", "words"), [(2.0, "softer"), (5000.0, "stiffer")])

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
@@ -32,7 +33,12 @@ from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from flexsheet.nodes.methods import Case, Family, Point, Trial
-from flexsheet.nodes.planner.force_table import load_force_model
+from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
+from flexsheet.nodes.planner.force_table import (
+    load_force_model,
+    load_or_compute,
+    make_table_cache,
+)
 from flexsheet.nodes.triangulator.benchmarks import MARKER
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
@@ -517,10 +523,26 @@ SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})
 
 
 def test_a_missing_force_table_is_replaced_and_reported(tmp_path: Path) -> None:
-    law, reported = load_force_model(SCENE, "table", tmp_path)
+    sheet = SCENE.sheet.model_copy(update={"thickness_m": 0.0012})
+    scene = SCENE.model_copy(update={"sheet": sheet})
+    law, reported = load_force_model(scene, "table", tmp_path)
     assert law.name == "scaled"
     assert "flexsheet precompute" in reported
-    assert load_force_model(SCENE, "scaled", tmp_path) == (law, "scaled")
+    assert load_force_model(scene, "scaled", tmp_path) == (law, "scaled")
+
+
+@pytest.mark.parametrize("file", sorted(SCENES.glob("*.yaml")), ids=lambda file: file.stem)
+def test_the_package_contains_the_force_table_of_each_shipped_scene(
+    file: Path, tmp_path: Path
+) -> None:
+    """If this test fails, run `python -m benchmarks.ship_tables`."""
+    scene = load_scene(file)
+    law, reported = load_force_model(scene, "table", tmp_path)
+    assert (law.name, reported) == ("table", "table")
+    stored = load_or_compute(scene, tmp_path)
+    assert isinstance(law, TabulatedSheetModel)
+    assert np.array_equal(stored.ratios, law.ratios)
+    assert make_table_cache(scene).path(tmp_path).is_file()
 
 
 @pytest.mark.parametrize(("load", "busy"), [(0.2, False), (3.9, False), (4.1, True), (40.0, True)])

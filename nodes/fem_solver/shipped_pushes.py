@@ -2,7 +2,7 @@
 
 For these scenes, no long computation is necessary before the coarse table is available. The files
 are in the folder `pushes`, and are named by the key of the table. The command `python -m
-benchmarks.ship_pushes` writes them. The key changes if any input of the pushes changes, so an
+benchmarks.ship_tables` writes them. The key changes if any input of the pushes changes, so an
 outdated file is not used.
 """
 

@@ -1,8 +1,14 @@
-"""Compute and cache the force table of a scene's sheet. The computation takes 1 to 2 minutes."""
+"""Compute and cache the force table of a scene's sheet. The computation takes 1 to 2 minutes.
+
+The folder `tables` of the package contains the table for the sheet of the shipped scenes. It is
+named by the key of the cache, so an outdated table is not used. The command `python -m
+benchmarks.ship_tables` writes it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +32,7 @@ VERSION = 1
 FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
 """The fields of `TabulatedSheetModel` that the cache file contains."""
 
+FOLDER = Path(__file__).with_name("tables")
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
 """The grid of push positions in the table, as fractions of the sheet's width and height."""
 
@@ -57,20 +64,29 @@ def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> TabulatedSheetModel:
-    """Return the force table of a scene from the cache, or compute and store the table."""
+    """Return the force table of a scene from the cache.
+
+    A table that is not in the cache is copied from the package, or computed, and stored.
+    """
+    entry = make_table_cache(scene)
+    shipped = load_cached(entry, FOLDER)
+    compute = partial(compute_table, scene, progress)
+    return cached(entry, cache_dir, compute if shipped is None else lambda: shipped)
+
+
+def compute_table(
+    scene: Scene, progress: Progress = lambda done, total: None
+) -> TabulatedSheetModel:
+    """Compute the force table of a scene."""
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
-    return cached(
-        make_table_cache(scene),
-        cache_dir,
-        lambda: compute_membrane_table(
-            make_rubber(sheet),
-            stretches=np.array(ends),
-            xs_m=sheet.width_m * XS,
-            ys_m=sheet.height_m * YS,
-            finger_radius_m=scene.finger.radius_m,
-            progress=progress,
-        ),
+    return compute_membrane_table(
+        make_rubber(sheet),
+        stretches=np.array(ends),
+        xs_m=sheet.width_m * XS,
+        ys_m=sheet.height_m * YS,
+        finger_radius_m=scene.finger.radius_m,
+        progress=progress,
     )
 
 
@@ -79,12 +95,14 @@ def load_force_model(
 ) -> tuple[SheetForceModel, str]:
     """Return the force model of an uncalibrated sheet, and a note for the operator.
 
-    If the method is "table" but the cache contains no table, a `ScaledSheetModel` is returned.
+    If the method is "table" but neither the cache nor the package contains the table, a
+    `ScaledSheetModel` is returned.
     """
     rubber = make_rubber(scene.sheet)
     if method != "table":
         return ScaledSheetModel(rubber), method
-    table = load_cached(make_table_cache(scene), cache_dir)
+    entry = make_table_cache(scene)
+    table = load_cached(entry, cache_dir) or load_cached(entry, FOLDER)
     if table is None:
         note = "scaled; the table of the sheet's force is missing: run flexsheet precompute"
         return ScaledSheetModel(rubber), note

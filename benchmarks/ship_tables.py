@@ -1,10 +1,11 @@
-"""Solve the pushes of a scene's coarse table and write the file that is shipped with the program.
+"""Compute the tables of a scene that are shipped with the program.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.ship_pushes [SCENE_FILE]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.ship_tables [SCENE_FILE]
 
-With the file, the first start with the scene solves no push before the coarse table. The program
-uses the file only for the same object, finger radius, mesh and version of the solver; a test fails
-if the file of the demo's scene is outdated. Takes less than a minute.
+These are the pushes of the soft body's coarse table, and the force table of the sheet. With them,
+the first start with the scene computes neither. The program uses the files only for the same inputs
+and version of the computation; tests fail if the files of the demo's scene are outdated. Takes
+about three minutes.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from pathlib import Path
 
 from benchmarks.soft_body import SCENE_FILE
 from flexsheet.launch.plans.plan import load_scene
+from flexsheet.nodes.cache import save_cached
 from flexsheet.nodes.fem_solver import body, precompute_table, shipped_pushes, snapshots
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
+from flexsheet.nodes.planner import force_table
 
 
 class _QuickTableReady(Exception):
@@ -29,6 +32,8 @@ def main() -> None:
     parser.add_argument("scene", nargs="?", type=Path, default=SCENE_FILE)
     scene = load_scene(parser.parse_args().scene)
     _, spacing_m = choose_method(scene, "auto", "auto")
+    table = force_table.make_table_cache(scene)
+    print(save_cached(table, force_table.FOLDER, force_table.compute_table(scene)))
     spec = body.make_soft_body_spec(scene, spacing_m)
     entry = precompute_table.make_table_cache(body.make_table_spec(scene, spec))
     path = shipped_pushes.shipped_path(entry)
