@@ -200,6 +200,9 @@ def test_what_cannot_be_measured_is_reported(what: str) -> None:
         tilt_sizes(picture, 1.0)
 
 
+pytestmark = pytest.mark.timeout(900)
+"""Without a cache, the deflection shapes are computed first, with the lowest priority."""
+
 EyeSituation = tuple[SheetPose, DeformedSheet]
 Sizes = Callable[[Image, float], Sequence[float]]
 
