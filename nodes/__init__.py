@@ -114,6 +114,7 @@ def node_class(name: str) -> type[Node]:
         hint += '; name a node of your own as "module:Class"'
         raise UnknownNodeError(f'unknown node type "{name}"{hint}')
     try:
+        # The module is known only at run time, so the type of the class is not.
         return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]
     except (ImportError, AttributeError, SyntaxError) as error:
         advice = _describe_import_advice(module_name, class_name, error)

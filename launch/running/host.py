@@ -285,6 +285,7 @@ class HostAgent:
                 status = self._status()
                 self._publish("host", status)
                 self._report_busy(status)
+                self._limit_real_time()
             except OSError as error:
                 problem = f"the status of this host cannot be read: {error}"
                 if problem != self._status_error:
@@ -302,7 +303,6 @@ class HostAgent:
             self._busy_reported_ns = now_ns
             remedy = describe_busy_remedy(nice_denied=status.nice_denied)
             self._on_problem(f"{describe_busy(status)}; {remedy}")
-        self._limit_real_time()
 
     def _limit_real_time(self) -> None:
         """Withdraw the real-time priorities of this graph if another node gets no processor.
