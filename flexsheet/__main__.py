@@ -61,7 +61,6 @@ def main() -> None:
 
 
 def _run_node(config_file: str) -> NoReturn:
-    """Run the nodes of a configuration file, and end the process."""
     from flexsheet.launch.running.child import apply_niceness, exit_with_parent
 
     exit_with_parent()
@@ -73,7 +72,7 @@ def _run_node(config_file: str) -> NoReturn:
 
 
 def _shorten_imports() -> None:
-    """Disable garbage collection during imports, and import structlog without rich."""
+    """Shorten the imports: disable garbage collection, and import structlog without rich."""
     gc.disable()
     if "structlog" in sys.modules:
         return

@@ -156,7 +156,6 @@ app = typer.Typer(
 
 
 def _print_version(requested: bool) -> None:
-    """Print the version and exit if `requested` is true, which means that --version is given."""
     if requested:
         from importlib.metadata import version
 

@@ -125,10 +125,7 @@ class ArmTruth(Part):
 
     @classmethod
     def of(cls, arm: ArmSpec) -> Self:
-        """Return the parameters of a simulated arm that does not deviate from the scene.
-
-        arm: description of the arm in the scene.
-        """
+        """Return the parameters of a simulated arm that does not deviate from the scene's arm."""
         return cls(
             joint_offsets_rad=arm.joint_offsets_rad,
             flange_compliance_m_per_n=arm.flange_compliance_m_per_n,
@@ -252,9 +249,10 @@ class EyesTruth(Part):
 
 
 NOMINAL_DISPLAY_LATENCY_S = 0.008
-"""The nominal display latency, in seconds, to which `latency_offset_s` is added.
+"""The nominal display latency (s), to which `latency_offset_s` is added.
 
-The display latency is the time from the swap of an image to the middle of its display.
+The display latency is the time from a swap of the frame buffers to the middle of the display of
+the new frame.
 """
 
 

@@ -13,7 +13,7 @@ from flexsheet.messages.scene import NonNegative, Part, Pose
 
 
 class ArmPoseFit(Part):
-    """The error of the calibration for one measured pose of an arm."""
+    """The residuals of the calibration in one measured pose of an arm."""
 
     name: str
     used: bool

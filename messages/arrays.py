@@ -135,9 +135,8 @@ def _convert_lists(value: list[Any] | tuple[Any, ...], expected: np.dtype[Any]) 
 def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinite) -> bool:
     """Return whether all elements of an array are finite.
 
-    For an array of at most `few` elements, the function tests the sum of the elements, which is
-    faster than numpy's test. Because a sum of finite elements can overflow, numpy's test decides if
-    the sum is not finite.
+    The sum of at most `few` elements is tested first, because this is faster than numpy's test. A
+    sum of finite elements can overflow. If the sum is not finite, numpy's test therefore follows.
     """
     if array.size <= few and isfinite(sum(array.ravel().tolist())):
         return True

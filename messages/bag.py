@@ -71,7 +71,7 @@ class BagError(FlexsheetError):
 
 
 def join_frames(frames: Sequence[Any]) -> bytes:
-    """Encode the frames of a message as the data of one MCAP record.
+    """Encode the ZeroMQ frames (parts) of a message as the data of one MCAP record.
 
     The docstring of the module specifies the layout.
     """
@@ -83,7 +83,7 @@ def join_frames(frames: Sequence[Any]) -> bytes:
 
 
 def split_frames(data: bytes) -> list[memoryview]:
-    """Return views of the frames of a message that `join_frames` has encoded.
+    """Return views of the ZeroMQ frames (parts) of a message from the data of an MCAP record.
 
     Raises WireError if the data are invalid.
     """
@@ -170,7 +170,7 @@ class BagWriter:
     def write_frames(
         self, topic: Topic, frames: Sequence[Any], header: Header, log_time_ns: int
     ) -> None:
-        """Write a message that has already been encoded as frames.
+        """Write a message that is already encoded as ZeroMQ frames (message parts).
 
         log_time_ns: time when the message was received, ns of the recorder's clock.
         """
@@ -194,7 +194,7 @@ class BagWriter:
             self._writer.add_attachment(0, 0, name, media_type, data)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a named table of texts, which describes the recording, to the bag."""
+        """Add a named table of texts that describe the recording."""
         with self._writing():
             self._writer.add_metadata(name, dict(values))
 
@@ -301,7 +301,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class ChannelDecoder:
-    """A decoder for the messages of one channel.
+    """A decoder for the messages of one MCAP channel.
 
     recorded_type, fingerprint: name and hash of the message type at the time of the recording.
     migrate: function that converts the decoded fields to the current message type.
@@ -446,7 +446,7 @@ class BagReader:
             ) from error
 
     def frames(self) -> Iterator[tuple[str, list[memoryview], int]]:
-        """Yield (topic name, frames, log time in ns) of each message without decoding it."""
+        """Yield (topic name, ZeroMQ frames, log time in ns) of each message, without decoding."""
         for channel, record in self.records():
             try:
                 frames = split_frames(record.data)
@@ -504,10 +504,7 @@ class BagReader:
         )
 
     def info(self) -> BagInfo:
-        """Return a summary of the whole bag.
-
-        The summary also covers messages that this reader does not select.
-        """
+        """Return a summary of the whole bag, including messages that this reader skips."""
         times: dict[int, list[int]] = {}
         for chunk in self.chunks:
             for channel_id, stamps in chunk.times_ns.items():
@@ -541,7 +538,7 @@ class BagReader:
         )
 
     def _scan(self, file: IO[bytes]) -> None:
-        """Build an index of the file's records, up to the first truncated or invalid record."""
+        """Index the records of the file. Skip damaged records, and stop at a truncated record."""
         size = os.fstat(file.fileno()).st_size
         magic = file.read(len(MCAP0_MAGIC))
         if magic != MCAP0_MAGIC:
@@ -622,7 +619,6 @@ class BagReader:
             self.chunks[-1].times_ns[index.channel_id] = [time for time, _ in index.records]
 
     def _add_channel(self, channel: mcap_records.Channel) -> None:
-        """Store a recorded channel. If its topic has been renamed since, use the current name."""
         channel.topic = RENAMED_TOPICS.get(channel.topic, channel.topic)
         self.channels[channel.id] = channel
 
@@ -692,10 +688,7 @@ class BagReader:
         return find_migration(topic.message, fingerprint, recorded)
 
     def _make_decoder(self, channel: mcap_records.Channel) -> ChannelDecoder:
-        """Make the decoder of a channel.
-
-        Raises BagError if the recorded message type cannot be converted to the current type.
-        """
+        """Make a channel's decoder. Raises BagError if its topic or type cannot be converted."""
         if channel.topic not in TOPICS:
             raise BagError(
                 f'{self.path}: this version of flexsheet has no topic "{channel.topic}"; '
@@ -719,9 +712,6 @@ class BagReader:
 
 
 def _find_type_name(channel: mcap_records.Channel) -> str:
-    """Return the current name of a channel's message type, which differs from the recorded name if
-    the type has been renamed.
-    """
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
 
@@ -733,7 +723,7 @@ def info(path: Path | str) -> BagInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecoverReport:
-    """The result of the function `recover`.
+    """The result of the recovery of a bag.
 
     messages, attachments: numbers of recovered messages and attachments.
     was_complete: whether the original bag was complete.

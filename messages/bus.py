@@ -3,8 +3,8 @@
 A publisher binds its socket and subscribers connect to it, in any order. Publishers and subscribers
 can be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
 calls the handler there. `benchmarks/messaging.py` compares this design with others; this design has
-the smallest latency. A subscriber never waits in a `recv` call. Therefore a message cannot be lost
-because such a call is cancelled.
+the smallest latency. A subscriber never waits in a `recv` call, whose cancellation could lose a
+message.
 
 A subscriber has one socket per host, which identifies the host of each message. From each host, the
 subscriber accepts only messages of the nodes that run there. Sockets that other computers can reach
@@ -289,7 +289,7 @@ class Publisher:
             send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
-        """Read a batch of subscriptions, and send the stored message again to new subscribers.
+        """Read a batch of subscriptions, and send the stored message to these late subscribers.
 
         For a topic that is not latched, the socket reports only the first subscription and the end
         of the last subscription.
@@ -312,10 +312,7 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def _on_closed_by_guard(self, address: str, reason: str) -> None:
-        """Report that the connection guard closed a connection.
-
-        The thread of the connection guard calls this method.
-        """
+        """Report a closed connection. The thread of the connection guard calls this method."""
         text = f'topic "{self.topic.name}": a connection from {address} was closed: {reason}'
         if self._loop is None:
             self._on_refused(text)
@@ -371,13 +368,13 @@ class Subscriber:
         has doubled, except on topics with the delivery `latest`.
     on_handshake_failed: function that is called with a text for each kind of failed handshake. If
         None, `on_problem` is called.
-    raw: whether `on_message(frames, header)` is called with the undecoded frames of every message.
-        The fields are then not validated.
+    raw: whether `on_message(frames, header)` is called with the ZeroMQ frames (parts) of every
+        message. The fields are then neither decoded nor validated.
     keys: keys of this host and of the other hosts. If None, tcp connects to the loopback interface
         only.
     plan: hash of the resolved launch file whose messages are accepted. If None, all messages are
         accepted.
-    message_filter: function that is called with each valid message before `on_message`.
+    message_filter: function that returns the reason to reject a valid message, or None.
     on_disconnected: function that is called when a connection has ended, after its last message.
     local: bus that delivers messages from nodes in this process; not used if `raw` is true.
     """
@@ -469,9 +466,11 @@ class Subscriber:
                 connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
-        """Decode the header of a message, and check the header as in `accept_header`.
+        """Decode and check the header of a message, and count messages that were lost before it.
 
         Return None if the message is rejected, or if it has arrived before.
+
+        writers: names of the nodes that may publish at the endpoint; None means any node.
         """
         try:
             envelope = read_envelope(frames, self.topic)
@@ -534,9 +533,7 @@ class Subscriber:
         self.call(message, header)
 
     def call(self, message: Any, header: Header) -> None:
-        """Call the handler. If the handler raises an exception, report the exception and
-        continue.
-        """
+        """Call the message handler, and report an exception that the handler raises."""
         try:
             self._on_message(message, header)
         except Exception as error:
@@ -569,7 +566,7 @@ class Subscriber:
 
 
 class _Writer:
-    """The start time (epoch) and the sequence number of the newest message of a node.
+    """The epoch (start time) and the newest sequence number of a node that writes messages.
 
     A subscriber uses these values to reject copies of old messages. A node that restarts on the
     same clock has a later epoch. After a reboot of its host, the node has a new clock identifier,
@@ -611,16 +608,13 @@ class _Writer:
 
 
 def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
-    """Return the names of the nodes that publish at the endpoints.
-
-    Return None if the node at one of the endpoints is unknown.
-    """
+    """Return the names of the nodes that publish at endpoints, or None if one is unknown."""
     known = [one.writer for one in sources if one.writer is not None]
     return frozenset(known) if len(known) == len(sources) > 0 else None
 
 
 class _HostConnection:
-    """A socket of a subscriber that receives the messages of one host."""
+    """A subscriber's socket for the messages of one host."""
 
     def __init__(
         self,
@@ -653,7 +647,6 @@ class _HostConnection:
         return self._keys is not None and self.host is not None
 
     def open(self) -> None:
-        """Connect the socket, and start to read messages."""
         topic = self._subscriber.topic
         self._loop = asyncio.get_running_loop()
         self._socket = _open_socket(zmq.SUB, topic)
@@ -739,7 +732,6 @@ class _HostConnection:
             self.open()
 
     def _read(self) -> None:
-        """Deliver a batch of received messages. This method is a callback of the event loop."""
         if self._socket is None or self._socket.closed or self._loop is None:
             return
         drained = False

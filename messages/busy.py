@@ -23,7 +23,7 @@ def is_busy(host: HostStatus) -> bool:
 
 
 def describe_busy_remedy(*, nice_denied: bool) -> str:
-    """Return the advice for the user of an overloaded computer.
+    """Return the advice for the user of a busy computer.
 
     nice_denied: whether the nodes lack the process priority that the launch file requires.
     """
@@ -36,9 +36,7 @@ def describe_busy_remedy(*, nice_denied: bool) -> str:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Return a sentence with the reason why a computer is overloaded, or "" if there is no
-    overload.
-    """
+    """Return a sentence that states why a computer is busy, or "" if it is not busy."""
     if not is_busy(host):
         return ""
     if host.cpu is None:

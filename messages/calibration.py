@@ -105,10 +105,7 @@ class StereoCalibration(Part):
 
 
 def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) -> None:
-    """Check that a stereo calibration belongs to the camera in the scene.
-
-    Raises CalibrationMismatchError if the device or the image size differs.
-    """
+    """Raise CalibrationMismatchError unless device and image size agree with the scene."""
     if calibration.device != camera.device:
         raise CalibrationMismatchError(
             f'the calibration is of the camera "{calibration.device}", but the scene\'s camera is '

@@ -65,10 +65,7 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
 
 
 def _parse(path: Path) -> Any:
-    """Parse a calibration file in YAML.
-
-    Raises YAMLError if the file is too large or contains YAML that no calibration file contains.
-    """
+    """Parse a YAML file. Raises YAMLError if it is too large, or has aliases or deep nesting."""
     with path.open("rb") as file:
         data = file.read(MAX_CALIBRATION_BYTES + 1)
     if len(data) > MAX_CALIBRATION_BYTES:
@@ -78,17 +75,14 @@ def _parse(path: Path) -> Any:
 
 @lru_cache(maxsize=8)
 def _parse_text(text: str) -> Any:
-    """Parse YAML text, and cache the result.
-
-    The caller must not change the result, because later calls return the same object.
-    """
+    """Parse YAML text. The caller must not change the result, which is cached."""
     yaml = YAML(typ="safe", pure=True)
     yaml.Composer = CalibrationComposer
     return yaml.load(text)
 
 
 class CalibrationComposer(Composer):
-    """A YAML composer that rejects aliases and too many nested lists or mappings."""
+    """A YAML composer that rejects aliases and too deeply nested lists or mappings."""
 
     depth = 0
 

@@ -72,9 +72,9 @@ class ClockTable:
     def localize(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
         """Convert the timestamps of a message and its header to the local clock.
 
-        Return the message, the header, and the result of `find_problem`. If the offset of the
-        message's clock is unknown, the publication time is assumed to be the time of arrival
-        `now_ns`.
+        Return the message, the header, and the reason why the conversion is too inaccurate ("" if
+        it is accurate). If the offset of the message's clock is unknown, the publication time is
+        assumed to be the time of arrival `now_ns`.
         """
         clock_id = header.clock_id
         if clock_id == self._own:

@@ -1,4 +1,4 @@
-"""Close tcp connections on which a peer sends more data to a publisher than a subscriber needs to.
+"""Close tcp connections on which a publisher receives more data than a subscriber sends.
 
 A ZeroMQ publisher stores every subscription that a peer sends. A stored subscription needs about 45
 times as much memory as the received data. The subscriptions are stored in the call that sends the
@@ -68,8 +68,6 @@ The thread of the connection guard calls the function.
 
 @dataclass(frozen=True, slots=True)
 class _Publisher:
-    """The monitor socket of a publisher, and the function that reports its closed connections."""
-
     monitor: zmq.Socket[bytes]
     on_refused: OnRefused
 
@@ -120,8 +118,7 @@ class ConnectionGuard:
 
     @classmethod
     def watch(cls, publisher: zmq.Socket[bytes], on_refused: OnRefused) -> None:
-        """Monitor all future connections to a publisher, until the monitor of its socket is
-        disabled.
+        """Watch all new connections to a publisher until the monitor of its socket is disabled.
 
         on_refused: function that is called with the peer's address and the reason of each refusal.
         """
@@ -162,10 +159,7 @@ class ConnectionGuard:
                 self._accept(int(news["value"]), int(endpoint.rpartition(":")[2]), publisher)
 
     def _accept(self, fd: int, port: int, publisher: _Publisher) -> None:
-        """Start to monitor a new connection.
-
-        Close the connection if its address is temporarily refused or has too many connections.
-        """
+        """Watch a connection. Close it if its address is excluded or has too many connections."""
         with suppress(OSError), socket.socket(fileno=os.dup(fd)) as opened:
             local, remote = _ends(opened)
             if not remote or local[1] != port:
@@ -247,10 +241,7 @@ class ConnectionGuard:
 
 
 def _ends(opened: socket.socket) -> tuple[tuple[object, ...], tuple[object, ...]]:
-    """Return the local and the remote address of a connection.
-
-    Return empty tuples if the connection is closed.
-    """
+    """Return the local and remote address of a connection, or empty tuples if it is closed."""
     try:
         local, remote = opened.getsockname(), opened.getpeername()
     except OSError:

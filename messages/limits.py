@@ -105,7 +105,7 @@ MIN_POSITIVE = 1e-9
 """The minimum value of a positive number whose unit is not in `MIN_BY_UNIT`."""
 
 MAX_ROTATION_ERROR = 1e-4
-"""The maximum error of an element of R R^T for a rotation matrix R, where R^T is its transpose.
+"""The maximum deviation of an element of R R^T from the identity, for a rotation matrix R.
 
 The resulting position error at a distance of half a metre is 0.05 mm.
 """

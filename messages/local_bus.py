@@ -3,8 +3,8 @@
 A publisher passes each message to the subscribers in its process. The socket is used only while
 another process has subscribed. A subscriber checks the same properties as for messages from
 sockets: writer, plan, order, types, shapes and ranges. Arrays of at most `INLINE_BYTES` are copied,
-    because a sender can reuse their memory. Larger arrays are shared. All arrays are read-only for
-    the subscribers.
+because a sender can reuse their memory. Larger arrays are shared. All arrays are read-only for the
+subscribers.
 
 A message handler runs in a callback of the event loop after the sender's callback, never inside
 `send`.
@@ -126,10 +126,7 @@ class LocalChannel:
         self._last = None
 
     def interrupt(self) -> None:
-        """Report to the subscribers that the publishing node has disconnected.
-
-        The next message ends the disconnection.
-        """
+        """Report to the subscribers that the publishing node has disconnected."""
         for reader in self._readers:
             reader.report_end()
 
@@ -144,19 +141,16 @@ class LocalChannel:
 
 
 class LocalBus:
-    """The set of all message channels inside one process.
+    """The message channels inside one process, one for each endpoint.
 
-    endpoints: endpoints to which the publishers of this process bind. Each endpoint has one
-        channel.
+    endpoints: endpoints to which the publishers of this process bind.
     """
 
     def __init__(self, endpoints: Iterable[str]) -> None:
         self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
 
     def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
-        """Return the channel of the first endpoint that has a channel, or None if no endpoint has a
-        channel.
-        """
+        """Return the channel of the first endpoint that has one, or None if no endpoint has one."""
         return next((self._channels[one] for one in endpoints if one in self._channels), None)
 
 

@@ -48,10 +48,7 @@ class MarkerCalibration(Part):
 
 
 def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
-    """Check that a marker calibration belongs to the scene.
-
-    Raises CalibrationMismatchError if the marker was calibrated in another scene.
-    """
+    """Raise CalibrationMismatchError if the marker was calibrated in another scene."""
     if calibration.scene != scene.name:
         raise CalibrationMismatchError(
             f'scene: the marker was calibrated in the scene "{calibration.scene}", not in '

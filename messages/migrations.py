@@ -249,7 +249,6 @@ def rename_fields(model: type[BaseModel], fields: Fields) -> Fields:
 
 
 def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
-    """Rename the recorded fields of a nested model, or of each model in a list."""
     if model is not None and isinstance(value, dict):
         return rename_fields(model, value)
     if model is not None and isinstance(value, list):
@@ -279,8 +278,6 @@ def _unchanged(fields: Fields) -> Fields:
 
 
 class _Comparison:
-    """A comparison of a recorded JSON Schema with the current schema."""
-
     def __init__(self, old_parts: Schema, new_parts: Schema) -> None:
         self._old_parts, self._new_parts = old_parts, new_parts
         self._known: dict[tuple[int, int], bool] = {}

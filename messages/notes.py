@@ -326,7 +326,7 @@ SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "says",
     "display_latency": "projected images appear later than assumed",
 }
-"""The description of each cause that a node can suspect for a deviation from expected values."""
+"""The description of each suspected cause of a deviation from expected values."""
 
 SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "camera_moved": "Fasten the camera, and calibrate its pose again (docs/set-up-camera.md).",
@@ -347,7 +347,7 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "apart, or calibrate both again.",
     "display_latency": "Set `display_latency_s` of the renderer to the measured latency.",
 }
-"""The remedy for each cause that a node can suspect for a deviation from expected values."""
+"""The remedy for each suspected cause of a deviation from expected values."""
 
 _SHOWN_UNITS = {
     "m": ("mm", 1e3),

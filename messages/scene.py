@@ -550,7 +550,7 @@ class Projector(Part):
 class Eyes(Part):
     """The positions of the user's eyes.
 
-    The eyes are at equal distances from their midpoint along the x axis of the world.
+    The line through both eyes is parallel to the x axis of the world.
     """
 
     centre_world_m: Vector3

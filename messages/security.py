@@ -287,10 +287,6 @@ class ZapAuthenticator:
         self._socket.close(linger=0)
 
     def _answer(self) -> None:
-        """Answer all pending authentication requests.
-
-        This method is a callback of the event loop.
-        """
         while not self._socket.closed:
             try:
                 request = self._socket.recv_multipart(zmq.NOBLOCK)
@@ -319,10 +315,7 @@ class ZapAuthenticator:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return a file's modification time (ns), inode and size (bytes).
-
-    Return None if the file is missing.
-    """
+    """Return a file's modification time (ns), inode and size (bytes), or None if it is missing."""
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -42,9 +42,9 @@ class LeftOutRow(Part):
 
 
 class SheetTable(Part):
-    """A table of the ratios of the measured force on the finger to the fitted model's force.
+    """A table of the measured force on the finger, divided by the force of the fitted model.
 
-    Values are interpolated linearly over stretch and position, and by cubics over depth.
+    The ratio is interpolated linearly over stretch and position, and by cubics over depth.
     """
 
     stretch_ratios: Axis = Field(description="edge distance divided by the nominal width")
@@ -100,10 +100,7 @@ class SheetCalibration(Part):
 
 
 def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
-    """Check that a sheet calibration belongs to the sheet in the scene.
-
-    Raises CalibrationMismatchError if the sizes differ.
-    """
+    """Raise CalibrationMismatchError if the calibrated sheet differs in size from the scene's."""
     sizes = (
         ("width_m", calibration.nominal_width_m, sheet.width_m),
         ("height_m", calibration.height_m, sheet.height_m),

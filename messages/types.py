@@ -78,7 +78,7 @@ FingertipReason = Literal[
     "too_fast",
     "unconfirmed",
 ]
-"""The reason why no fingertip position was computed from an image pair.
+"""The reason why no fingertip position was computed from an image pair; "ok" if one was computed.
 
 no_marker: no marker was found.
 marker_in_one_view: only one camera sees the marker.

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
 
 class NodeRole(StrEnum):
-    """The role of a node in the graph. The launcher, `flexsheet doctor` and the replay use the role
-    instead of the class name.
+    """The role of a node in the graph, by which launcher, `flexsheet doctor` and replay select it.
 
     A node class declares its role as the attribute `role`. A class that publishes ArmState is an
     arm bridge by default.
@@ -72,14 +71,14 @@ NODES: dict[str, str] = {
 
 
 class UnknownNodeError(FlexsheetError, KeyError):
-    """An error for a node type that is not in `NODES`. The error text suggests a similar type."""
+    """Raised if a node type is not in `NODES`. The text suggests a similar type."""
 
     code = "unknown-node"
     remedy = "`flexsheet node types` prints all names."
 
 
 class NodeImportError(FlexsheetError, ImportError):
-    """An error for a node class "module:Class" that cannot be imported.
+    """Raised if a node class "module:Class" cannot be imported.
 
     advice: text that states how to correct this error.
     """

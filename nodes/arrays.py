@@ -1,6 +1,4 @@
-"""Define names of array types. The shapes and units of arrays are stated in the docstrings that use
-them.
-"""
+"""Define names of array types. The docstrings that use them state shapes and units."""
 
 from __future__ import annotations
 

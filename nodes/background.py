@@ -43,9 +43,9 @@ def leave_real_time(thread: int = 0) -> bool:
 
 
 def end_real_time(pid: int) -> bool:
-    """Call `leave_real_time` for all threads of a process, and return whether one had it.
+    """End the real-time priority of all threads of a process.
 
-    Returns False if the process has ended.
+    Returns whether a thread had real-time priority; False if the process has ended.
     """
     found = False
     with suppress(FileNotFoundError):

@@ -28,8 +28,8 @@ DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile
 """The exceptions that can occur when a damaged file, or a file of another program, is read."""
 
 CACHED_S = 1.0
-"""The time (s) after the start of a computation. Steps that finish within this time count as loaded
-from the cache, and the estimate of the remaining time ignores them."""
+"""The time (s) from the start of a computation in which finished steps count as loaded from the
+cache. The estimate of the remaining time ignores these steps."""
 MINUTE_S = 60.0
 
 

@@ -34,7 +34,7 @@ class Rejection(StrEnum):
 
 
 class RejectedError(ValueError):
-    """An error for an external message that must not enter the graph."""
+    """Raised if an external message must not enter the graph."""
 
     def __init__(self, reason: Rejection) -> None:
         super().__init__(reason.value)
@@ -58,7 +58,7 @@ def check_finite(values: Floats) -> Floats:
 
 
 def rotate_x_axis(quaternion: Floats) -> Floats:
-    """Return the x axis (3,) of a frame whose orientation is the quaternion (x, y, z, w).
+    """Rotate the x axis by a quaternion (x, y, z, w), and return the rotated axis (3,).
 
     Raises RejectedError unless the length of the quaternion is 1 within QUATERNION_TOLERANCE.
     """
@@ -73,7 +73,7 @@ def make_eye(centre_world_m: Floats, right_world: Floats, scene: Scene) -> Eye:
     """Make a message with the position of the user's eyes.
 
     centre_world_m: midpoint (3,) of the eyes.
-    right_world: unit vector (3,) from the left to the right eye.
+    right_world: direction (3,) from the left to the right eye, of any length except zero.
 
     Raises RejectedError if the position is not finite, or too far from the eye position in the
     scene.

@@ -1,5 +1,4 @@
-"""Define method families for benchmarks. A family consists of interchangeable methods and a common
-reference.
+"""Define method families for benchmarks: interchangeable methods with a common reference.
 
 The folder of a node contains the methods as plain functions, and their `Family`. The module
 `launch.methods.charts` plots the time of each method against its error over the scene's working
@@ -184,10 +183,9 @@ def clip_range(end: float, values: Sequence[float]) -> tuple[float, ...]:
 
 
 def pareto_front(points: Sequence[Point]) -> list[str]:
-    """Return the methods that are Pareto-optimal in at least one benchmark case of their valid
-    range.
+    """Return the methods on the Pareto front of at least one benchmark case in their valid range.
 
-    The methods are sorted by the maximum of their median times.
+    The methods are sorted by the maximum of their median times over these cases.
     """
     usable = [point for point in points if point.in_range]
     front = {

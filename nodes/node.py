@@ -65,9 +65,7 @@ recorders that start late receive the full log, too."""
 
 
 class NodeParameters(LimitedModel):
-    """The base class for the parameters of a node. Subclasses declare parameters as fields with
-    defaults.
-    """
+    """The base class for a node's parameters, which subclasses declare as fields."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -230,7 +228,7 @@ class Timer:
 
 
 def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make a decorator for a node's method that must be called periodically.
+    """Return a decorator that marks a node's method as periodic.
 
     rate_parameter: name of the node parameter that contains the rate (Hz).
     """
@@ -306,7 +304,7 @@ class Node:
     status: Output[Status]
 
     takes_frames: ClassVar[bool] = False
-    """Whether `deliver` receives each message as raw frames that are not decoded."""
+    """Whether `deliver` receives each message as undecoded ZeroMQ frames (message parts)."""
     measures_clocks: ClassVar[bool] = False
     """Whether the node measures the clocks of other hosts, so that their timestamps are not
     converted."""
@@ -345,9 +343,7 @@ class Node:
 
     @classmethod
     def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
-        """Return the reason to omit the node from a graph with this scene, or None to start the
-        node.
-        """
+        """Return the reason to omit the node from a graph with this scene, or None."""
         return None
 
     @classmethod
@@ -481,7 +477,7 @@ class Node:
                 self.report_error(f"on_{port}", error)
 
     async def step(self, port: str, message: Message, header: Header) -> None:
-        """Store a message in its input, call its handler, and wait until it is finished.
+        """Store a message in its input, call its handler, and wait until the handler has finished.
 
         Replays and tests use this method.
         """
@@ -493,7 +489,7 @@ class Node:
         return self.clock_table.localize(message, header, self.clock.now_ns())
 
     async def handle(self, port: str, message: Message, header: Header, clock_problem: str) -> None:
-        """Store a message in its input, call its handler, and wait until it is finished.
+        """Store a message in its input, call its handler, and wait until the handler has finished.
 
         header: header with timestamps of this host's clock.
         clock_problem: reason why the timestamps are not reliable, or "" if they are.
@@ -504,9 +500,9 @@ class Node:
             await self.call(f"on_{port}", handler, message, header)
 
     async def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
-        """Call a handler or a timer method. Count, log and report an exception of the method.
+        """Call a handler or a periodic method, and report an exception that it raises.
 
-        what: name of the handler or timer in the log.
+        what: name of the called method in the report.
         """
         try:
             result = function(*arguments)

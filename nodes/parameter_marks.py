@@ -1,6 +1,4 @@
-"""Define annotated types for node parameters. The annotations inform the launcher about the use of
-a value.
-"""
+"""Define annotated types of node parameters, which tell the launcher how a value is used."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ from pydantic import BaseModel, Field
 
 
 class ParameterMark(StrEnum):
-    """A mark that informs the launcher about the use of a node parameter."""
+    """A mark that tells the launcher how a node parameter is used."""
 
     LISTEN_PORT = "listen_port"
     DEVICE_HOST = "device_host"

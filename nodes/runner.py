@@ -86,7 +86,7 @@ class ProcessConfig(BaseModel):
     """The configuration of a process and its nodes.
 
     ready_fd: file descriptor of a pipe to the launcher; None if there is no launcher.
-    realtime_priority: real-time priority when all nodes are ready; None if there is none.
+    realtime_priority: real-time priority after all nodes are ready; None for normal priority.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -128,8 +128,6 @@ class NodeTransport:
                 )
 
     def _make_refusal_handler(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
-        """Return a function that counts and logs the connections that an output has refused."""
-
         def on_refused(text: str) -> None:
             counts.rejected += 1
             self._log.warning("output", topic=topic.name, problem=text)
@@ -176,10 +174,7 @@ class NodeTransport:
                 self._open_stop_socket(node, config.port)
 
     def _open_stop_socket(self, node: Node, port: str) -> None:
-        """Open a socket for e-stops from tools.
-
-        The socket also works if the launcher does not respond.
-        """
+        """Open a socket for e-stops from tools. It works even if the launcher does not respond."""
 
         def stop(reason: str) -> None:
             now_ns = node.clock.now_ns()
@@ -264,7 +259,7 @@ class NodeTransport:
 
 
 async def run_timer(node: Node, number: int, timer: Timer) -> None:
-    """Call a node's periodic method on a fixed time grid, and skip times that have passed."""
+    """Call a node's periodic method at multiples of its period, and skip overdue calls."""
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
     loop = asyncio.get_running_loop()
     due_s = loop.time()
@@ -414,9 +409,7 @@ class Heartbeat:
             os.set_blocking(fd, False)
 
     def report_ready(self) -> None:
-        """Record that one node is ready. When all nodes are ready, send the first heartbeat to the
-        launcher.
-        """
+        """Record that one node is ready. When all nodes are ready, send the first heartbeat."""
         self._starting -= 1
         if self._starting == 0:
             self._on_ready()
@@ -424,17 +417,14 @@ class Heartbeat:
 
     def beat(self) -> None:
         if self._fd is not None and self._starting <= 0:
-            # A full pipe contains enough heartbeats.  If the launcher has ended, so will this
+            # A full pipe contains enough heartbeats. If the launcher has ended, so will this
             # process: its lifeline (a pipe to the launcher) is then closed.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
 
 
 class LoggedNodeError(Exception):
-    """An error that is raised after the failure of a node.
-
-    The failure is already logged with the name of the node.
-    """
+    """Raised after a node has failed and its failure has been logged with the node's name."""
 
 
 async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
@@ -467,7 +457,7 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
 
 
 def _prioritize(config: ProcessConfig) -> None:
-    """Enter real time after the start, so that imports and tables do not delay other programs."""
+    """Set the real-time priority after the start, so that the start delays no other program."""
     if config.realtime_priority is not None:
         asyncio.get_running_loop().set_default_executor(
             ThreadPoolExecutor(thread_name_prefix="asyncio", initializer=leave_real_time)

@@ -1,8 +1,8 @@
 """Receive e-stops on a unix socket of a launcher or a node.
 
 All tools share one endpoint of the topic `estop`, and only one command-line tool at a time can use
-that endpoint. Any number of tools can connect to this socket. Each tool sends one packet and
-receives an answer. This module imports only small modules, so that the tools start quickly.
+that endpoint. Many tools can connect to this socket at the same time. Each tool sends one packet
+and receives an answer. This module imports only small modules, so that the tools start quickly.
 """
 
 from __future__ import annotations

@@ -259,10 +259,7 @@ class ViewState:
         return draw_mesh("object", vertices, self.skin.triangles, stamp, SKIN_COLOUR)
 
     def _sheet(self, stamp: Any) -> Any | None:
-        """Return a drawing of the sheet as a flat surface between its clamped edges.
-
-        Return None if the pose of an edge is unknown.
-        """
+        """Draw the sheet as a flat surface; return None if the pose of an edge is unknown."""
         corners = find_sheet_corners(self.scene, self.flanges)
         if corners is None:
             return None

@@ -202,7 +202,7 @@ def _find_type(annotation: Any) -> Any:
 
 
 def _make_conversion(annotation: Any) -> Get:
-    """Return a function that converts values of an annotated type to the Arrow type."""
+    """Return a function that converts values with the given type annotation to Arrow values."""
     inner, spec = split_annotation(annotation)
     if spec is not None:
         return np.ravel
@@ -222,10 +222,7 @@ def _make_conversion(annotation: Any) -> Get:
 
 
 def _applied(get: Get, function: Callable[[Any], Any]) -> Get:
-    """Return a function that applies `function` to the result of `get`.
-
-    If the result of `get` is None, the returned function returns None.
-    """
+    """Return a function that returns `function(get(row))`, or None if `get(row)` is None."""
 
     def apply(row: Any) -> Any:
         value = get(row)

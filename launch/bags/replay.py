@@ -133,7 +133,7 @@ class Verification:
 
     @property
     def as_live(self) -> bool:
-        """Return whether the replayed outputs equal the recorded outputs within a tolerance."""
+        """Return whether the outputs are as in the live run, within the tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()

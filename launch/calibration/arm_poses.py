@@ -90,10 +90,10 @@ class ArmPosesError(FlexsheetError, ValueError):
 
 
 def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRig:
-    """Return the lenses and poses of the stereo camera.
+    """Return the intrinsics and extrinsics of the stereo camera.
 
-    If a calibration is given, it provides the lenses and the transform between them. Otherwise, the
-    scene provides them. The camera's pose in the world always comes from the scene.
+    If a calibration is given, it provides the intrinsics and the transform between both cameras.
+    Otherwise, the scene provides them. The camera's pose in the world always comes from the scene.
     """
     measured = scene.camera if calibration is None else calibration
     pose = scene.camera.world_from_left
@@ -250,7 +250,7 @@ class PoseRecorder:
         self._poses: list[Floats] = []
 
     def update_joints(self, joints_rad: Floats, time_s: float) -> None:
-        """Add measured joint angles (6,), in rad, at `time_s`."""
+        """Add joint angles (6,), in rad, that were measured at `time_s`."""
         moved = self._joints is None or np.abs(joints_rad - self._joints).max() > MAX_STILL_RAD
         if moved:
             self._joints, self._still_since_s = joints_rad, time_s
@@ -323,10 +323,7 @@ def _is_same_pose(pose: Floats, other: Floats) -> bool:
 
 
 def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
-    """Return the pose world_from_base (4, 4) of a simulated arm.
-
-    The pose deviates at random from the arm's pose in the scene.
-    """
+    """Draw a random true pose world_from_base (4, 4) of an arm, near its pose in the scene."""
     pose: Pose = getattr(scene.arms, side).world_from_base
     nominal = pose_matrix(pose)
     random = np.random.default_rng([seed, side == "left"])
@@ -433,7 +430,6 @@ def simulate_poses(
 
 
 def _is_in_both_views(simulated: TwinBoard, left_from_board: Floats) -> bool:
-    """Return whether all corners of the board are at least 40 px inside both images."""
     size = np.array([simulated.camera.width_px, simulated.camera.height_px])
     views = simulated.corners(left_from_board)
     return all(((view > 40.0) & (view < size - 40.0)).all() for view in views)

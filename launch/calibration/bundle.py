@@ -87,9 +87,9 @@ def rms_distance(shifts: Floats) -> float:
 
 
 def lens_arrays(lens: Floats) -> tuple[Floats, Floats]:
-    """Return the camera matrix (3, 3) and OpenCV's distortion coefficients (5,) of a lens.
+    """Return the camera matrix (3, 3) and OpenCV's distortion coefficients (5,) of a camera.
 
-    lens: parameters (8,) fx, fy, cx, cy (px), k1, k2, p1, p2.
+    lens: intrinsics (8,): fx, fy, cx, cy (px), k1, k2, p1, p2.
     """
     fx, fy, cx, cy, k1, k2, p1, p2 = lens
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -113,10 +113,10 @@ def pose_vector(transform: Floats) -> Floats:
 
 
 def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats, Floats]:
-    """Project n points (n, 3), in m, into an image.
+    """Project n points (n, 3), in m, in the board's frame into an image.
 
-    Return the pixel positions (n, 2), and their derivatives with respect to the pose (2n, 6) and to
-    the lens parameters (2n, 8).
+    Return the pixel positions (n, 2), and their derivatives with respect to the board pose (2n, 6)
+    and to the intrinsics (2n, 8).
     """
     matrix, distortion = lens_arrays(lens)
     pixels, slope = cv2.projectPoints(points, pose[:3], pose[3:], matrix, distortion)
@@ -141,7 +141,7 @@ def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """The m residuals of one image pair, with derivatives.
+    """The m residuals of one image pair, with their derivatives.
 
     Each corner in each image has two residuals, one along x and one along y.
 
@@ -298,7 +298,7 @@ def board_pose(view: BoardView, board: Floats, lens: Floats) -> Floats:
     Return a rotation vector (rad) and a position (m), together (6,).
 
     board: corners of the board (n, 3), m.
-    lens: lens parameters (8,), as for `lens_arrays`.
+    lens: intrinsics (8,): fx, fy, cx, cy (px), k1, k2, p1, p2.
     """
     points = board[view.ids]
     _, rotation, position = cv2.solvePnP(points, view.pixels, *lens_arrays(lens))

@@ -27,7 +27,7 @@ from flexsheet.messages.scene import Lens
 from flexsheet.nodes.arrays import Floats, Image
 
 COLUMNS, ROWS = 4, 3
-"""The numbers of columns and rows of cells into which an image is divided to count the coverage."""
+"""The numbers of columns and rows in the grid of cells that divides an image."""
 
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
@@ -35,10 +35,7 @@ STILL_PX = 0.5
 """The board is at rest if its corners move by less than this distance (px) between two images."""
 
 NEW_POSE_PX = 12.0
-"""The minimum median displacement (px) of the board's corners since each accepted image pair.
-
-If the displacement is smaller, the pose of the board is not new.
-"""
+"""The minimum median displacement (px) of the board's corners between two accepted image pairs."""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
@@ -51,7 +48,7 @@ image's diagonal.
 
 
 class BinGroup(StrEnum):
-    """The kinds of conditions, in the order in which the user is asked to meet the conditions."""
+    """The groups of conditions (`Bin`), in the order in which the user is asked to meet them."""
 
     TILT = "tilt"
     DISTANCE = "distance"
@@ -118,11 +115,11 @@ class Capture:
         pairs: int = 20,
         still_images: int = 4,
     ) -> None:
-        """Create a selector that has not yet accepted a pair.
+        """Create a selector of image pairs.
 
-        lens: approximate lens of the left camera.
+        lens: approximate intrinsics of the left camera.
         size: width and height of the images, px.
-        pairs: number of pairs to accept.
+        pairs: number of image pairs to accept.
         still_images: number of consecutive images in which the board must be at rest.
         """
         self.board = board
@@ -172,7 +169,6 @@ class Capture:
         return PairAssessment(True, self._make_hint("accepted; "))
 
     def _find_bins(self, pair: BoardPair) -> list[Bin]:
-        """Return the conditions that an image pair meets."""
         pose = board_pose(pair.left, self._points, self._lens)
         bins = [Bin(BinGroup.PAIRS), Bin(BinGroup.TILT, classify_tilt(pose, self._middle))]
         bins.append(Bin(BinGroup.DISTANCE, self._classify_distance(pose)))
@@ -194,10 +190,6 @@ class Capture:
         return "near" if fraction > NEAR else "far" if fraction < FAR else "middle"
 
     def _make_hint(self, prefix: str) -> str:
-        """Return an instruction to the user for the next pose of the board.
-
-        prefix: text before the instruction.
-        """
         missing = self.missing()
         if not missing:
             return prefix + "all required poses of the board are captured"

@@ -164,7 +164,6 @@ def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: F
 
 
 def _rms(values: Floats) -> float | None:
-    """Return the root mean square of an array, or None if the array is empty."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
@@ -200,8 +199,8 @@ def check_stereo(
 ) -> dict[str, float | int | list[str] | None]:
     """Evaluate a stereo calibration with images of a board that were not used to calibrate.
 
-    Return the values of `summarize` and a list `used_to_calibrate`. The list names each left image
-    whose pair was also used to calibrate. The errors of such pairs are underestimated.
+    Return the rms errors (see `summarize`) and a list `used_to_calibrate`. The list names each left
+    image whose pair was also used to calibrate. The errors of such pairs are underestimated.
 
     Raises CalibrationError if the images have a wrong size or if no pair shows the board.
     """

@@ -42,12 +42,12 @@ class CommissionError(FlexsheetError, ValueError):
 class StepName(StrEnum):
     """The steps of a commissioning (calibration of a whole laboratory), in their order.
 
-    camera: optics of the stereo camera.
+    camera: intrinsics of both cameras, and the transform between them.
     arms: poses of the arm bases relative to the camera.
     edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
         the flanges.
     sheet: force model of the sheet.
-    projector: pose and lens of the projector.
+    projector: intrinsics and pose of the projector.
     marker: position of the marker on the finger.
     eyes: positions of the viewer's eyes.
     delays: servo lags of the arms, offset of the camera's timestamps, and latency of the projector.
@@ -194,8 +194,8 @@ class Commissioning:
     apparatus: true parameters of a simulated laboratory, as given by --apparatus; None for real
         devices.
 
-    Raises CommissionError if the commissioning in the folder was started with other files, or if
-    the folder contains other data.
+    Raises CommissionError if the folder contains other data, or a commissioning that was started
+    with other files.
     """
 
     folder: Path
@@ -352,7 +352,7 @@ class Commissioning:
 
 
 def _make_yaml(value: Any) -> Any:
-    """Convert a value so that each list is on one line in a YAML document."""
+    """Return a value for a YAML document in which each list is on one line."""
     if not isinstance(value, list):
         return value
     row = CommentedSeq([_make_yaml(one) for one in value])
@@ -446,10 +446,6 @@ def is_good(state: State) -> bool:
 
 
 def _format_figures(figures: Mapping[str, Any]) -> list[str]:
-    """Return Markdown tables with the main results of the verification.
-
-    The first table contains the metrics that have a tolerance.
-    """
     measured = _find_measured_errors(figures)
     lines = [
         "| metric | measured | predicted root mean square | predicted 95 % | tolerance |",
@@ -570,10 +566,7 @@ def list_doubts(
 
 
 def _describe_effects(figures: Mapping[str, Any]) -> str:
-    """Return a text in parentheses: latency and number of lost messages in the finger's stroke.
-
-    The text is empty if neither was measured.
-    """
+    """Return the latency and the lost messages of the stroke in parentheses, or an empty text."""
     stroke = figures.get("stroke", {})
     effects = []
     latency_ms = stroke.get("latency_ms", {}).get("exposure_to_frame", {}).get("p50")
@@ -603,10 +596,7 @@ of the mean square error in motion.
 
 
 def _describe_nearest_metric(figures: Mapping[str, Any]) -> str | None:
-    """Describe the metric that is nearest to its tolerance.
-
-    Return None if no metric was measured.
-    """
+    """Describe the metric that is nearest to its tolerance; None if no metric was measured."""
     measured = _find_measured_errors(figures)
     ratios = {
         metric: measured[metric] / one["tolerance"]

@@ -259,11 +259,11 @@ def _refine_corners(
 ) -> Floats:
     """Move corners to the nearby saddle points of the grey levels.
 
-    Return the refined positions (n, 2). A window must not contain edges of a neighbouring corner or
-    marker, because they would shift the corner by several pixels. Smoothing reduces noise and JPEG
-    artefacts in the gradients.
+    Return the refined positions (n, 2). The window of a corner must not contain edges of a
+    neighbouring corner or marker, because they would shift the corner by several pixels. Smoothing
+    reduces noise and JPEG artefacts in the gradients.
 
-    larger: image that `_enlarge` returned.
+    larger: image, enlarged by the factor SCALE.
     start: initial corners (n, 2).
     half_px: half side lengths (n,) of the windows.
     smoothing_px: standard deviation of the Gaussian filter.
@@ -286,8 +286,8 @@ def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
     """Renumber the corners (n, 2) of the right image to match the left image.
 
     A detector can start its numbering at either end of the board, or at any corner of a square
-    board. Because the cameras of a stereo rig are nearly parallel, the matching numbering has the
-    same directions in both images.
+    board. The cameras of a stereo rig are nearly parallel. Therefore, the rows and columns of the
+    matching numbering have the same directions in both images.
     """
     grid = right.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
@@ -309,7 +309,7 @@ def match_views(
 
     If this is impossible, return the reason as text.
 
-    names: names of the two images, for the reason.
+    names: names of the two images in this text.
     """
     if left is None or right is None:
         missing = [name for name, seen in zip(names, (left, right), strict=True) if seen is None]

@@ -176,7 +176,6 @@ def estimate_stamp_offset(
 
     pairs: image pairs with their timestamps (ns).
     edges: motion of each clamp, computed from measured joint angles.
-    detector: detector of the marks.
     """
     seen: list[list[tuple[int, Floats]]] = [[] for _ in edges]
     for at_ns, pair in pairs:
@@ -279,12 +278,9 @@ def swing_sheet(
 ) -> tuple[tuple[SampledMotion, ...], tuple[SampledMotion, ...]]:
     """Simulate arms that move the sheet periodically along its y axis, after one second at rest.
 
-    Return the true motions of both clamps. Also return the motions that are computed from measured
-    joint angles.
+    Return the true motions of both clamps, and the motions that follow from measured joint angles.
 
     swing_m: amplitude of the motion.
-    frequency_hz: frequency of the motion.
-    seconds: duration of the motion.
     """
     start = SheetTrajectoryPlanner(scene, PlannerParameters()).motion
     sheet = SimulatedSheet(scene, apparatus, start, LoopSettings())

@@ -1,8 +1,8 @@
 """Measure the latency of the projector with the stereo camera.
 
 The renderer switches the projected image between white and black at random times. It publishes
-these times in its messages about frames. A camera image of the sheet shows the state before or
-after a switch, and therefore limits the possible latency. The latency is estimated from all images
+these times in its messages about frames. A camera image of the sheet shows whether the light has
+already changed, and therefore bounds the latency. The latency is estimated from all images
 together.
 """
 
@@ -59,11 +59,11 @@ class DisplayLatencyError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SwitchImage:
-    """A camera image that was taken after a switch of the projected image.
+    """A camera image that was taken after a switch of the projected image between white and black.
 
     switched_s: time when the renderer switched the projected image.
     start_s, end_s: start and end of the camera's exposure.
-    is_new: whether the camera image shows the state after the switch.
+    is_new: whether the camera image shows the new projected image.
 
     All times are in seconds of the same clock.
     """
@@ -77,13 +77,12 @@ class SwitchImage:
 def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
     """Estimate the latency (s) from a switch of the image to the change of the light on the sheet.
 
-    The model assumes that a camera image shows the state after the switch if the light changed
-    before the middle of the exposure. The times have unknown errors, and an unknown fraction of the
-    images is classified wrongly. The result is the mean and the standard deviation of the posterior
+    The model assumes that a camera image shows the new projected image if the light changed before
+    the middle of the exposure. The times have unknown errors, and an unknown fraction of the images
+    is classified wrongly. The result is the mean and the standard deviation of the posterior
     distribution with a uniform prior.
 
-    Raises DisplayLatencyError if there are too few switches, or if the images do not show the
-    switches.
+    Raises DisplayLatencyError if there are too few switches, or if the images do not show them.
     """
     switches = len({one.switched_s for one in images})
     if switches < MIN_SWITCHES:
@@ -118,9 +117,7 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
 def classify_images(
     switches: Sequence[tuple[float, bool]], exposures: Iterable[tuple[float, float, float]]
 ) -> list[SwitchImage]:
-    """Decide for each camera image whether it shows the state after the last switch.
-
-    The decision depends on the brightness of the image.
+    """Decide from the brightness of each camera image whether it shows the newest projected image.
 
     switches: time (s) of each switch between white and black, and whether the new image is white.
     exposures: for each camera image, start (s) and end (s) of the exposure, and mean grey level.

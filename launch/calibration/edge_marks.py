@@ -46,19 +46,16 @@ position in the world and the joint angles of both arms.
 MAX_PROBLEMS = 20
 
 ALONG = (-0.45, 0.0, 0.45)
-"""The positions of the simulated marks along the clamped edge, as fractions of the edge's length.
-
-The edge's centre has the position 0.
-"""
+"""The positions of the marks relative to the edge's centre, as fractions of the edge's length."""
 
 SIMULATED_POSES = 24
 MAX_TRIES = 400
 TILT_RAD = np.array([0.5, 0.35, 0.1])
 CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
 MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
-"""The minimum stretch ratio of the simulated sheet, and the used fraction of a range.
+"""The minimum stretch ratio of the simulated sheet, and the used fraction of the range above it.
 
-The range extends from this minimum to the maximum stretch ratio in the scene.
+The range ends at the maximum stretch ratio in the scene.
 """
 
 SEARCH_M = 0.02
@@ -105,7 +102,7 @@ def make_detector_config() -> DetectorConfig:
 
 
 class MarkDetector:
-    """A detector of marks in stereo images."""
+    """A detector of the marks on the clamps in stereo images."""
 
     def __init__(self, scene: Scene, calibration: StereoCalibration | None) -> None:
         self._geometry = StereoGeometry.of(scene.camera, calibration)
@@ -120,7 +117,7 @@ class MarkDetector:
         left_origin_px: tuple[int, int] = (0, 0),
         right_origin_px: tuple[int, int] = (0, 0),
     ) -> Floats | None:
-        """Return the position (3,), in m, of the mark near an expected position.
+        """Return the world position (3,), in m, of the mark near an expected position.
 
         Return None if no mark or several marks are found near the expected position.
 
@@ -162,7 +159,7 @@ class EdgeMarkRecorder:
             csv.writer(file).writerow(COLUMNS)
 
     def update_joints(self, side: Side, joints_rad: Floats, time_s: float) -> None:
-        """Add measured joint angles (6,), in rad, of one arm at `time_s`."""
+        """Add joint angles (6,), in rad, of one arm that were measured at `time_s`."""
         before = self._joints.get(side)
         if before is None or np.abs(joints_rad - before).max() > MAX_STILL_RAD:
             self._joints[side], self._still_since_s = joints_rad, time_s

@@ -46,9 +46,9 @@ of the bead and the cross.
 
 MIN_ALIGNMENTS = 6
 OUTLIER_RATIO = 2.0
-"""The distance, as a multiple of the median, above which the Huber loss of the fit is linear.
+"""The offset of a cross from its line of sight above which the Huber loss is linear.
 
-Source: Huber, Robust estimation of a location parameter (1964).
+The unit is the median offset. Source: Huber, Robust estimation of a location parameter (1964).
 """
 
 MAX_ANGLE_RAD = 0.02

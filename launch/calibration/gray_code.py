@@ -1,8 +1,8 @@
 """Generate Gray-code patterns for structured light, and decode camera images of the patterns.
 
 A camera pixel is wider than a projector pixel, so the camera does not resolve the finest stripes.
-For each camera pixel, decoding finds a cell of a few projector pixels that lights it. To find the
-image position of a projector pixel with subpixel accuracy, a quadratic map is fitted to the cells
+For each camera pixel, decoding finds a cell of a few projector pixels that lights it. To find a
+projector pixel in the camera image with subpixel accuracy, a quadratic map is fitted to the cells
 around this pixel. Moreno and Taubin (2012) fit local homographies instead.
 """
 

@@ -10,11 +10,11 @@ Mechanisms Robotics 5(3), 2013). Then all unknowns are fitted to all corners of 
 
 The real flange deviates from the forward kinematics by some tenths of a millimetre. In a pair of
 images, all corners are affected by the same deviation. Therefore, the model contains a small random
-flange motion for each pose. The standard deviations of this mixed model are estimated by restricted
+error of each flange pose. The standard deviations of this mixed model are estimated by restricted
 maximum likelihood (REML; Patterson and Thompson, Biometrika 58(3), 1971). If all corners were
 treated as independent, the uncertainty would be underestimated several times.
 
-In this module, a motion (6,) is a rotation vector (rad) followed by a translation (m).
+In this module, a pose correction (6,) is a rotation vector (rad) followed by a translation (m).
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class HandEyeError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class CameraLens:
-    """The camera matrix (3, 3), in px, and Brown's distortion coefficients (5,) of a lens."""
+    """The intrinsics of a camera: matrix (3, 3), px, and Brown's distortion coefficients (5,)."""
 
     matrix: Floats
     distortion: Floats
@@ -137,7 +137,7 @@ class CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class LensRig:
-    """The lenses and poses of the stereo camera.
+    """The intrinsics and extrinsics of the stereo camera.
 
     right_from_left: transform (4, 4) from the left to the right camera's frame.
     world_from_left: transform (4, 4) from the left camera's frame to the world.
@@ -195,14 +195,13 @@ class PoseResidual:
 class BaseFit:
     """The estimated pose of the arm's base, with its uncertainty and residuals.
 
-    covariance: covariance (6, 6) of the motion from the estimated to the true base pose. The motion
-        is a rotation (rad) about the base's origin in world axes, then a translation (m). If
-        `jackknife_ratio` is above 1, the covariance has been multiplied by `jackknife_ratio`
-        squared.
+    covariance: covariance (6, 6) of the correction from the estimated to the true base pose. The
+        correction is a rotation (rad) about the base's origin in world axes, then a translation
+        (m). If `jackknife_ratio` is above 1, the covariance is multiplied by this ratio squared.
     corner_sigma_px: standard deviation of the error of one pixel coordinate of a corner.
     arm_sigma_rad, arm_sigma_m: standard deviations of one component of the flange's pose error.
     jackknife_ratio: ratio of the jackknife's standard deviation to the standard deviation of the
-        fit. It is an rms over the six components of the motion.
+        fit. It is an rms over the six components of the correction.
     leave_one_out: changes (n, 6) of the base pose if each of the n poses in turn is excluded from
         the fit.
     """
@@ -238,9 +237,9 @@ class _Unknowns:
     flange_from_board: Floats
 
     def apply_step(self, step: Floats) -> _Unknowns:
-        """Apply a motion to the base and a motion to the board, each about its own origin.
+        """Correct both poses, each by a rotation about its own origin and a translation.
 
-        step: motion (6,) of the base, then motion (6,) of the board.
+        step: correction (6,) of the base pose, then correction (6,) of the board pose.
         """
         return _Unknowns(
             apply_motion(self.world_from_base, step[:6]),
@@ -250,15 +249,15 @@ class _Unknowns:
 
 @dataclass(frozen=True, slots=True)
 class _LinearizedPose:
-    """The corners of one pose, linearized at the current estimates of the unknowns.
+    """The residuals of the board corners in one arm pose, linearized at the current estimates.
 
-    measured: flange motion (6,), in the flange's frame, that fits the corners best.
+    measured: correction (6,) of the flange pose, in the flange's frame, that fits the corners best.
     spread: covariance (6, 6) of `measured` if the corner noise is 1 px.
-    by_unknowns: derivatives (6, 12) of the flange motion with respect to the motions of the base
-        and the board.
-    inner_px2: sum of the squared pixel residuals that remain after the flange motion `measured`.
+    by_unknowns: derivatives (6, 12) of this correction with respect to corrections of the base pose
+        and the board pose.
+    inner_px2: sum of the squared residuals that remain after the correction.
     count: number of corner coordinates.
-    rms_px: rms residual of the corners before the flange motion.
+    rms_px: rms residual of the corners before the correction.
     """
 
     measured: Floats
@@ -405,11 +404,10 @@ def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
 def _linearize_pixels(
     detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Compute the residuals of the corners, and the derivatives for a small flange motion.
+    """Compute the residuals of the corners, and the derivatives of their projections.
 
     Return residuals (m,), in px, of the m pixel coordinates of all corners. Also return the
-    derivatives (m, 6) of the projected coordinates with respect to rotation (rad) and translation
-    (m).
+    derivatives (m, 6) with respect to a rotation (rad) and a translation (m) of the flange.
     """
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
@@ -532,11 +530,11 @@ def _compute_discrepancies(
 
 
 def _find_rough_inliers(discrepancies: Floats) -> Bools:
-    """Return a mask (n,) that selects from n poses those for the first fit.
+    """Return a mask (n,) that is true for each of the n poses that is used in the first fit.
 
     A pose is excluded if its error exceeds a multiple of the median error.
 
-    discrepancies: differences (n, 6) that `_compute_discrepancies` returned.
+    discrepancies: differences (n, 6) between flange poses from joint angles and from images.
     """
     good = np.ones(len(discrepancies), dtype=bool)
     for part, min_error in ((slice(0, 3), MIN_ARM_RAD), (slice(3, 6), MIN_ARM_M)):
@@ -554,10 +552,9 @@ class _NoiseModel:
     arm_m: float
 
     def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
-        """Return the weights (n, 6, 6) of the flange motions of n poses.
+        """Return the weights (n, 6, 6) of the corrections of n flange poses.
 
-        A weight is the inverse of the covariance that results from the errors of the corners and of
-        the arm.
+        A weight is the inverse of the covariance that results from the errors of corners and arm.
         """
         arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in poses])
@@ -704,10 +701,10 @@ def _estimate_deviations(
 
 
 def apply_motion(pose: Floats, motion: Floats) -> Floats:
-    """Rotate a pose (4, 4) about the origin of the pose, and translate it.
+    """Rotate a pose (4, 4) about its own origin, and translate it.
 
-    motion: rotation vector (rad) and translation (m), together (6,), in the axes of the frame to
-        which the pose refers.
+    motion: rotation vector (rad) and translation (m), together (6,), in the axes of the parent
+        frame.
     """
     rotation = rotation_from_vector(motion[:3])
     return transform(rotation @ pose[:3, :3], pose[:3, 3] + motion[3:])

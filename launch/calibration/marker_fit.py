@@ -158,8 +158,8 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     def solve(logarithms: Floats) -> tuple[float, Floats, Floats, Floats]:
         """Return the cost, the offset (3,), its covariance (3, 3), and the weighted residuals.
 
-        logarithms: logarithm (3,) of each of three standard deviations divided by its expected
-            value.
+        logarithms: logarithms (3,) of the ratios of three standard deviations to the expected
+            values.
         """
         noise, turned, placed = (expected_m * np.exp(logarithms)) ** 2
         covariance = fixed + turned * same_orientation + placed * same_point

@@ -1,4 +1,4 @@
-"""Calibrate the optics and the pose of the projector from points that its pixels light.
+"""Calibrate the intrinsics and the pose of the projector from points that its pixels light.
 
 A projector is an inverse camera, because each of its pixels lights a point. The points are on the
 sheet, and the two cameras of the stereo camera measure their positions. Therefore, the poses of the
@@ -50,7 +50,7 @@ The errors are of the rotation (rad), position (m), focal length (relative) and 
 
 
 class ProjectorError(FlexsheetError, ValueError):
-    """Raised if images or points do not determine the optics and pose of the projector."""
+    """Raised if images or points do not determine the intrinsics and pose of the projector."""
 
     code = "projector-calibration"
     exit_code = 2
@@ -104,7 +104,7 @@ def measure_points(
     """Triangulate the points that projector pixels light, from images of each sheet pose.
 
     poses: for each pose, the images of the Gray-code patterns from the left and the right camera.
-    camera: stereo camera with calibrated optics and with `world_from_left` from the scene.
+    camera: stereo camera with calibrated intrinsics and with `world_from_left` from the scene.
     projector: projector, of which only the image size is used.
 
     Raises ProjectorError if the patterns cannot be decoded.
@@ -161,7 +161,7 @@ def project_points(projector: Projector, world: Floats) -> Floats:
 
 
 def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
-    """Fit the optics and the pose of a projector to the points that its pixels light.
+    """Fit the intrinsics and the pose of a projector to the points that its pixels light.
 
     guess: initial values of the projector.
 
@@ -253,11 +253,9 @@ def _measure_coverage(pixels: Floats, projector: Projector) -> float:
 def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) -> Projector:
     """Fit a projector's pose, focal length, principal point and distortion by least squares.
 
-    The fitted distortion coefficients are k1, k2, p1 and p2.
-
-    The aspect ratio and k3 are fixed to the values of `guess`. OpenCV's fit is not used, because it
-    rejects a principal point outside the image. If a projector has lens shift, its principal point
-    is outside the image.
+    The fitted distortion coefficients are k1, k2, p1 and p2. The aspect ratio and k3 are fixed to
+    the values of `guess`. OpenCV's fit is not used, because it rejects a principal point outside
+    the image. If a projector has lens shift, its principal point is outside the image.
 
     inliers: mask (n,) that is true for each of the n points to use.
     """
@@ -280,7 +278,7 @@ def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) ->
         return np.asarray((projected.reshape(-1, 2) - pixels).ravel())
 
     def derivatives(x: Floats) -> Floats:
-        """Return the derivatives (2n, 13) of the residuals of n points with respect to 13 unknowns.
+        """Return the derivatives (2n, 13) of the residuals with respect to the 13 unknowns.
 
         The unknowns are rotation (3), translation (3), focal length, principal point (2), and the
         distortion coefficients k1, k2, p1 and p2.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""The length (px of the camera image) of an arrow for a residual at the 95 % quantile."""
+"""The length (px of the camera image) of the arrow for the 95 % quantile of the residuals."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }

@@ -48,7 +48,7 @@ REPEAT_PX = 1.0
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
-    """Fit the lens parameters (8,), as for `lens_arrays`, of one camera to its images of the board.
+    """Fit fx, fy, cx, cy (px), k1, k2, p1 and p2 (8,) of one camera to its images of the board.
 
     points: corners of the board (n, 3), m.
     size: width and height of the images, px.
@@ -79,7 +79,7 @@ def compute_misfits(
     (6,) of the reference: a rotation vector (rad) and a translation (m).
 
     points: corners of the board (n, 3), m.
-    left, right: lens parameters (8,).
+    left, right: intrinsics (8,): fx, fy, cx, cy (px), k1, k2, p1, p2.
     """
     left_poses = [pose_transform(board_pose(pair.left, points, left)) for pair in pairs]
     right_poses = [pose_transform(board_pose(pair.right, points, right)) for pair in pairs]
@@ -118,7 +118,7 @@ def count_corners(pair: BoardPair) -> int:
 
 
 def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
-    """Return the image pairs after removing their outlier corners.
+    """Return the image pairs without their outlier corners.
 
     The standard deviation of the residuals is estimated from their median, because outliers hardly
     affect the median. The median length of normally distributed residuals in two dimensions is
@@ -229,10 +229,7 @@ class PairSelection:
                 self.good[i] = pair
 
     def stray_corners(self, number: int) -> int:
-        """Return the number of outlier corners that were removed from a used pair.
-
-        number: index of the pair.
-        """
+        """Return how many outlier corners were removed from the used pair with index `number`."""
         whole = self.found[number]
         if isinstance(whole, str) or number not in self.good:
             return 0
@@ -273,10 +270,7 @@ def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int
 
 
 def make_undetermined_error(pairs: int, reason: str) -> CalibrationError:
-    """Make the error that reports that the pairs do not determine the stereo rig.
-
-    pairs: number of pairs.
-    """
+    """Make the error for a number of `pairs` that do not determine the stereo rig."""
     return CalibrationError(
         f"the {pairs} pairs do not determine the rig ({reason}); change the tilt of the board "
         "between images"

@@ -34,7 +34,7 @@ At smaller depths, errors of the fingertip's position change the expected force 
 """
 
 REVERSAL_M = 0.001
-"""The push changes between loading and unloading if the depth reverses by more than this (m)."""
+"""A push changes between loading and unloading if the depth reverses by more than this (m)."""
 
 MAX_ROWS = 300
 

@@ -115,7 +115,6 @@ class Hysteresis:
     """A fitted hysteresis of the sheet.
 
     ratio: fraction of the loading energy that is lost in a cycle of loading and unloading.
-    standard_deviation: standard deviation of `ratio`.
     """
 
     ratio: float
@@ -195,7 +194,7 @@ def fit_sheet_model(
     The weight of the Mooney term is a further, optional parameter. The least-squares fit is robust:
     it first uses a soft-L1 loss, and then omits outliers.
 
-    nominal: initial rubber of the fit.
+    nominal: material parameters from which the fit starts.
     with_mooney: whether the weight of the Mooney term is fitted.
     with_prior: whether the nominal width and ideal rubber are used as prior values. If all pushes
         have almost the same stretch, the prior values are needed to determine the width.
@@ -334,7 +333,7 @@ def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: fl
 
 
 def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
-    """Return the measured force divided by the modelled force, minus one (n,), for n pushes."""
+    """Return the ratios (n,) of measured to modelled force, minus one, of n pushes."""
     forces, _ = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
     ratios: Floats = measured / np.maximum(forces, 1e-6) - 1.0

@@ -82,11 +82,9 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 def _parse_row(
     where: str, cells: Mapping[str, str], sheet: SheetSpec, problems: list[Problem]
 ) -> dict[str, float]:
-    """Convert the values in a row of the CSV file to numbers.
+    """Convert the values in a row of the CSV file to numbers by column.
 
-    Return the numbers by column. Errors in the row are appended to `problems`.
-
-    where: location of the row, as FILE:LINE.
+    Append a problem to `problems` for each wrong value.
     """
     values: dict[str, float] = {}
     for name, text in cells.items():

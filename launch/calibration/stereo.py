@@ -183,9 +183,6 @@ def compute_uncertainty(
 
 
 def make_lens(numbers: Floats) -> Lens:
-    """Make a lens from eight numbers.
-
-    numbers: parameters fx, fy, cx, cy (px) and distortion coefficients k1, k2, p1, p2.
-    """
+    """Make a lens from the numbers fx, fy, cx, cy (px), k1, k2, p1 and p2."""
     fx, fy, cx, cy, k1, k2, p1, p2 = (float(number) for number in numbers)
     return Lens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=(k1, k2, p1, p2, 0.0))

@@ -40,9 +40,10 @@ MAX_LENGTH_MM = 5000.0
 
 
 def read_touches(path: Path, scene: Scene) -> list[Touch]:
-    """Read touches from a CSV file. The document docs/set-up-marker.md lists the columns.
+    """Read touches (marker positions while the finger touched known points) from a CSV file.
 
-    Raises BadInputError if the file is invalid.
+    The document docs/set-up-marker.md lists the columns. Raises BadInputError if the file is
+    invalid.
     """
     problems: list[Problem] = []
     touches = []
@@ -63,11 +64,9 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 
 
 def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) -> dict[str, float]:
-    """Convert the values in a row of the CSV file to numbers.
+    """Convert the values in a row of the CSV file to numbers by column.
 
-    Return the numbers by column. Errors in the row are appended to `problems`.
-
-    where: location of the row, as FILE:LINE.
+    Append a problem to `problems` for each wrong value.
     """
     values: dict[str, float] = {}
     for name, text in cells.items():
@@ -180,9 +179,7 @@ def simulate_touches(
 def _see_marker(
     camera: TwinCamera, scene: Scene, geometry: StereoGeometry, pad: Floats
 ) -> TriangulatedPoint | None:
-    """Return the marker that the detector finds in simulated images.
-
-    Return None if the detector does not find a marker.
+    """Return the marker that the detector finds in simulated images, or None.
 
     pad: position (3,) of the fingertip's pad.
     """

@@ -409,10 +409,6 @@ def plot(
 
 
 def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
-    """Print the number of exported messages of each topic or channel.
-
-    Topics that cannot be read are also listed.
-    """
     if result.unreadable:
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
@@ -470,7 +466,6 @@ def _print_verification(result: Verification) -> None:
 
 
 def _describe_result(result: Verification) -> str:
-    """Describe the result of `bag verify` and the likely cause of a difference."""
     if result.errors:
         return "the node failed; see its last error above"
     if not result.same_bytes:
@@ -498,7 +493,7 @@ def _format_worst(fields: dict[str, float]) -> str:
 async def _record(
     given: dict[str, Any], plan: ResolvedGraph, run: Run, seconds: float | None
 ) -> int:
-    """Record topics of the running graph in this process, and return the exit code 0.
+    """Record topics of the running graph in this process; always return 0, the exit code.
 
     given: values of the recorder's parameters.
     seconds: duration of the recording. If it is None, the duration is not limited.
@@ -550,7 +545,6 @@ async def _record(
 
 
 async def _show_remaining(label: str, duration_s: float | None) -> None:
-    """Show a progress bar for a recording; show nothing if its duration is not limited."""
     if duration_s is None:
         return
     loop = asyncio.get_running_loop()
@@ -572,7 +566,7 @@ async def _play(
     loop: bool,
     as_json: bool,
 ) -> int:
-    """Publish the messages of a bag to a running graph; return the exit code 0.
+    """Publish the messages of a bag to a running graph; always return 0, the exit code.
 
     rate: playback speed relative to the recording.
     start_s: time in the bag at which playback starts.

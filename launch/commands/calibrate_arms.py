@@ -437,10 +437,7 @@ def _print_result(
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return how far a calibrated arm base is from its pose in the scene.
-
-    The result is a distance (m) and an angle (rad).
-    """
+    """Return the shift (m, rad) of a calibrated arm base relative to its pose in the scene."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation

@@ -216,7 +216,7 @@ def simulate_views(
 def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     """Return the stereo camera of the scene.
 
-    If a calibration is given, the camera has the calibrated lenses and baseline.
+    If a calibration is given, the camera has the calibrated intrinsics and relative pose.
     """
     optics = load_optics(calibration, scene)
     if optics is None:
@@ -249,7 +249,7 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
 
 
 def list_scene_values(projector: Projector) -> dict[str, Any]:
-    """Return the pose and the lens of a projector as new values for a scene file.
+    """Return the pose and the lens parameters of a projector as new values for a scene file.
 
     Each key is a dotted path, such as `projector.world_from_projector.rpy_rad`.
     """
@@ -288,8 +288,7 @@ def _print_result(
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
     """Return the errors (mm) of the projected image that the user sees.
 
-    The result has an entry "before" and an entry "after" the calibration. Each entry contains the
-    mean and the maximum error.
+    The result contains the mean and the maximum error "before" and "after" the calibration.
 
     fitted: calibrated projector.
     true: simulated projector.

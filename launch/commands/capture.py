@@ -133,8 +133,8 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
 def _show_coverage(capture: Capture) -> Iterator[Any]:
     """Show which of the required board poses have been captured.
 
-    The function yields another function (hint, accepted), which updates the display after each
-    image pair. If stderr is not a terminal, one line is printed for each accepted pair.
+    The function yields a function (hint, accepted) that updates the display after each image pair.
+    If stderr is not a terminal, one line is printed for each accepted pair.
     """
     if not words.is_terminal:
 

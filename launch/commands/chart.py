@@ -172,7 +172,7 @@ def _report(progress: Callable[[str], None], family: str, text: str) -> None:
 
 
 def _measure_system(measure: Callable[..., dict[str, Any]], image: Path, *, as_json: bool) -> None:
-    """Measure graph configurations, and write the results and a chart.
+    """Measure latencies and errors of graph configurations, and write the results and a chart.
 
     measure: function that measures and returns the results. It receives a function to which it
         reports its progress.

@@ -187,10 +187,7 @@ class Laboratory:
 
     @contextmanager
     def _folder(self, step: StepName) -> Iterator[Path]:
-        """Yield the folder with the captured data of a step.
-
-        If the data are simulated, this is a temporary folder.
-        """
+        """Yield the folder with a step's captured data, or a temporary folder for a simulation."""
         if self.apparatus is None:
             yield self._find_data(step)
             return

@@ -19,10 +19,7 @@ if TYPE_CHECKING:
 
 
 def _keys_of(module: str, name: str) -> Callable[[str], list[str]]:
-    """Return a function that completes the keys of a dictionary.
-
-    The dictionary is the variable `name` of the given module.
-    """
+    """Return a function that completes the keys of the dictionary `name` in a module."""
 
     def complete(incomplete: str) -> list[str]:
         return _filter(getattr(import_module(module), name), incomplete)
@@ -120,7 +117,6 @@ def node_parameters(incomplete: str) -> list[str]:
 
 
 def _running_nodes() -> list[ResolvedNode]:
-    """Return the nodes of the running graph; return an empty list if no graph is running."""
     from flexsheet.launch.commands.graph import NoGraphError, running_graph
 
     try:

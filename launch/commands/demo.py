@@ -79,7 +79,6 @@ def demo(
 
 
 def _print_result(result: DemoResult) -> None:
-    """Print the result of one experiment."""
     if result.strokes:
         print_strokes(result.strokes)
     if result.followed is not None:
@@ -90,7 +89,6 @@ def _print_result(result: DemoResult) -> None:
 
 
 def _print_results(result: DemoResult, bag: Path) -> None:
-    """Print the results of all finished experiments as JSON."""
     print_json(
         {
             "strokes": result.strokes,

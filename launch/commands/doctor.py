@@ -138,7 +138,7 @@ def _print_reach(layout: Layout) -> None:
 
 
 def _describe_branch(branch: dict[str, Any]) -> str:
-    """Describe a joint solution by names such as "elbow up", or by the joint angles in degrees."""
+    """Describe a branch (joint solution) by names such as "elbow up", or by angles in degrees."""
     if "seed_rad" not in branch:
         return ", ".join(f"{part} {value}" for part, value in branch.items())
     degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])

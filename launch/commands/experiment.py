@@ -510,10 +510,7 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
 
 def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print the mean errors of each variant over all strokes of the finger.
-
-    The 95 % confidence interval of each mean is also printed.
-    """
+    """Print the mean errors of each variant over all strokes, with 95 % confidence intervals."""
 
     def with_interval(found: dict[str, Any] | None) -> str:
         if found is None:
@@ -645,7 +642,6 @@ def _report_gestures(
     *,
     as_json: bool,
 ) -> None:
-    """Write the result and the figure of `experiment stability --gestures`, and print a table."""
     import json
 
     from flexsheet.launch.experiments.pictures import draw_hand_gestures

@@ -118,10 +118,9 @@ def robustness(
 
 
 def _print_predictions(found: dict[str, Any]) -> None:
-    """Print how often predictions and true errors agree that the hardware is within tolerance.
+    """Print how often predicted and true errors are within tolerance, as confusion matrices.
 
-    The table counts the four combinations of prediction and true errors. The first row is for whole
-    reports, and each further row is for one metric.
+    The first row is for whole reports, and each further row is for one metric.
     """
     cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
     every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}

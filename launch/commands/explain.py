@@ -133,7 +133,7 @@ def find_entries(text: str) -> list[Entry]:
 
 
 def _contains(text: str, phrase: str) -> bool:
-    """Return whether a text contains a phrase that is not a part of longer words."""
+    """Return whether a text contains a phrase as whole words."""
     return re.search(rf"(?<!\w){re.escape(phrase)}(?!\w)", text) is not None
 
 

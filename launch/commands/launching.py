@@ -146,7 +146,7 @@ def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, A
 
 
 def warn_of_loop_risk(plan: ResolvedGraph) -> None:
-    """Print a warning if the sheet and the hand that touches it can oscillate in this scene."""
+    """Print a warning if the control loop of sheet and hand can oscillate in this scene."""
     from flexsheet.launch.health.compliance import check_graph
 
     finding = check_graph(plan)
@@ -155,7 +155,7 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """Check in a thread whether the sheet and the hand that touches it can oscillate.
+    """Check in a thread whether the control loop of sheet and hand can oscillate.
 
     The check is omitted if the planner does not run on `host`.
     """

@@ -104,7 +104,7 @@ def _format_command(name: str, command: Any) -> Iterator[str]:
 
 
 def _escape(text: str) -> str:
-    """Escape the characters of a text that have a special meaning in roff.
+    """Remove markup from a text, and escape the characters that have a special meaning in roff.
 
     These are backslashes, hyphens, and dots or apostrophes at the start of a line.
     """

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from rich.status import Status
 
 FAILED, BAD_INPUT, NOT_GOOD = 1, 2, 3
-"""The exit codes of a failure, of invalid input, and of a completed command whose result is not
-good."""
+"""The exit codes of a failure, of invalid input, and of a completed command with a bad result."""
 
 PROGRESS_LINE_S = 2.0
 """The minimum time (s) between two printed progress lines if stderr is not a terminal."""

@@ -182,7 +182,7 @@ def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, d
 async def _await_statuses(
     plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
 ) -> int:
-    """Wait for statuses of nodes until `done` returns True, and store the changed parameters.
+    """Receive statuses of nodes until `done` returns True, and store the changed parameters.
 
     The parameters are stored in `found` by node name and parameter name. Returns 0, or 1 on a
     timeout.
@@ -195,7 +195,10 @@ async def _await_statuses(
 
 
 async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) -> int:
-    """Publish a parameter change, and wait until the node's status confirms it; return 0."""
+    """Publish a parameter change, and wait until the node's status confirms it.
+
+    Returns 0, the exit code. Raises CommandError if the change is not confirmed.
+    """
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
     from flexsheet.messages.types import ParameterChange
 

@@ -106,9 +106,9 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
 async def _collect_statuses(
     plan: ResolvedGraph, run: Run, statuses: dict[str, Status], hosts: dict[str, HostStatus]
 ) -> int:
-    """Store the statuses of all nodes and hosts by name; return the exit code 0.
+    """Receive the statuses of all nodes and hosts for at most STATUS_TIMEOUT_S; always return 0.
 
-    The function waits for at most STATUS_TIMEOUT_S.
+    They are stored by name in `statuses` and `hosts`.
     """
     handlers: dict[str, Callable[[Any], None]] = {
         "status": lambda message: statuses.update({message.node: message}),

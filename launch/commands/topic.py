@@ -362,7 +362,6 @@ def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def _summarize(values: list[float]) -> dict[str, float] | None:
-    """Return the median, 99 % quantile and maximum, or None if there are no values."""
     import numpy as np
 
     if not values:

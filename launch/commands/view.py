@@ -75,10 +75,7 @@ def view(
 async def _serve(
     make_server: Callable[[], LiveServer], port: int, duration_s: float | None, as_json: bool
 ) -> int:
-    """Serve viewers until the duration has passed, and return the exit code 0.
-
-    If `duration_s` is None, the time is not limited.
-    """
+    """Serve viewers for a duration (None: until Ctrl-C); always return 0, the exit code."""
     from flexsheet.launch.viewing.live_server import ADDRESS
 
     try:

@@ -51,9 +51,9 @@ class ArmsNotReadyError(ExperimentError):
 
 
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
-    """Check names and remove duplicates; if there are no names, return all known names.
+    """Return the given names without duplicates; if none are given, return all known names.
 
-    kind: noun that the error text uses for the names. Raises ExperimentError if a name is unknown.
+    kind: noun for the names in the error text. Raises ExperimentError if a name is unknown.
     """
     for name in names:
         if name not in known:
@@ -62,10 +62,11 @@ def select_names(names: Sequence[str], known: Collection[str], kind: str) -> lis
 
 
 def find_recorded(entries: Mapping[str, Entry], kind: str, label: str) -> Entry:
-    """Return the entry with the given label.
+    """Return the entry of a bag that has the given label.
 
-    entries: entries of a bag, with labels as keys. kind: noun that the error text uses for an
-    entry. Raises ExperimentError if there is no such entry.
+    entries: entries of the bag, by label. kind: noun for an entry in the error text.
+
+    Raises ExperimentError if there is no such entry.
     """
     if label not in entries:
         labels = ", ".join(entries) or "none"

@@ -65,9 +65,7 @@ HOVER_M = 0.03
 APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
-"""The duration (s) of a rest, and the time (s) at the end of each rest in which the force is
-evaluated.
-"""
+"""The duration (s) of a rest, and the time (s) at its end in which the force is evaluated."""
 
 MEASURED_S = 0.6
 """The time (s) at the end of each rest over which the measured forces of a gauge are averaged."""
@@ -76,17 +74,12 @@ REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
 
 HISTORY_STEP_S = 0.01
-"""The time step (s) with which the force history of the rubber is computed.
-
-The finger moves 0.5 mm in a time step.
-"""
+"""The time step (s) with which the force history of the rubber is computed."""
 HISTORY_DEPTHS = 9
 HISTORY_CELLS = 16
-"""The number of membrane elements per side in the computation of the elastic force curve.
+"""The numbers of depths and of membrane elements per side for the elastic force curve.
 
 The force history of the rubber is computed from this curve.
-
-HISTORY_DEPTHS is the number of depths in the curve.
 """
 
 
@@ -104,9 +97,9 @@ class RestInterval:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One push of the finger at a position on the object.
+    """A press of the finger at a position on the object.
 
-    place: name of the pushed position.
+    place: name of the position.
     place_m: distance (m) along the object, and arc length (m) around the object from its front.
     surface, normal: point (3,) and normal (3,) of the undeformed object at this position, in the
         world frame.
@@ -123,7 +116,7 @@ class Press:
 
 
 def make_presses(scene: Scene) -> list[Press]:
-    """Return the finger paths of all pushes of the experiment in a scene."""
+    """Return all presses of the experiment in a scene, with their finger paths."""
     deepest_m = scene.working_range.push_depth_m
     depths = np.append([depth for depth in DEPTHS_M if depth < deepest_m], deepest_m)
     resting = [_make_resting_press(scene, along, around, depths) for along, around in POSITIONS_M]
@@ -158,10 +151,9 @@ def _make_press(
     motion: Floats,
     holds: tuple[RestInterval, ...],
 ) -> Press:
-    """Make a push at a position from times and heights of the finger.
+    """Make a press in which the finger moves along the normal of the surface.
 
-    motion: array (n, 2) of n times (s) and heights (m) above the surface. place, place_m, holds:
-    see `Press`.
+    motion: n times (s) and heights (m) above the surface, (n, 2).
     """
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
@@ -176,10 +168,10 @@ def _make_press(
 
 
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make the procedure that pushes at all positions of the experiment.
+    """Make the procedure that presses the finger at all positions of the experiment.
 
-    method: least accurate method whose table is accepted. Before the first push, the procedure
-    waits until the soft body uses a table that is at least as accurate.
+    method: least accurate method whose table is accepted. Before the first press, the procedure
+        waits until the soft body uses a table that is at least as accurate.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -318,7 +310,7 @@ class ForceReference:
     def evaluate(self, at_ns: int, press: Press) -> ForceSample:
         """Return the true forces at the time `at_ns`.
 
-        press: push that contains this time. The depth is measured from its surface point.
+        press: press that contains this time. The depth is measured from its surface point.
         """
         tip, left, right = self._read_poses(at_ns)
         depth_m = float((press.surface - tip) @ press.normal)
@@ -349,8 +341,7 @@ class ForceReference:
     def _solve_n(
         self, left: Floats, right: Floats, tip: Floats, press: Press, cells: int = CELLS
     ) -> float:
-        """Return the force (N) of a purely elastic sheet on the finger, in the direction of the
-        push.
+        """Return the force (N) of an elastic sheet on the finger along the normal of the press.
 
         left, right: poses (4, 4) of the sheet's edges.
         tip: fingertip (3,).
@@ -364,7 +355,7 @@ class ForceReference:
     def _history_ratio(self, at_ns: int, press: Press) -> float:
         """Return the ratio of the rubber's force to the force of an elastic sheet.
 
-        at_ns: time during the push `press`.
+        at_ns: time during the press.
         """
         if ForceHistory.of(self._recorded.apparatus) is None:
             return 1.0
@@ -375,11 +366,10 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return n times (ns) in a push, and the n ratios of the rubber's force to the force of an
-        elastic sheet.
+        """Return n times (ns) in a press, and n ratios of the rubber's force to the elastic force.
 
         The membrane is solved at a few depths only, with the poses of the edges at the deepest
-        point of the push. This is sufficient, because the ratio depends only on the shape of the
+        point of the press. This is sufficient, because the ratio depends only on the shape of the
         force curve.
         """
         begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
@@ -469,8 +459,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 
 
 def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
-    """Return the mean force (N) that a gauge measured in a rest, or None if there is no
-    measurement.
+    """Return the mean force (N) that a gauge measured in a rest; None without a measurement.
 
     The averaging interval is longer than the interval for the true force, because gauges are slow.
 
@@ -492,9 +481,9 @@ def _evaluate_moving(
 
 
 def _summarize_against_reference(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the median and maximum error (%) at each position.
+    """Return the median and the maximum error (%) at each position.
 
-    Only result rows with a reference force are used.
+    rows: result rows that have a reference force.
     """
     result = []
     for place in dict.fromkeys(row["at"] for row in rows):

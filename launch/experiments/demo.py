@@ -111,8 +111,10 @@ def make_demo_procedures(
 def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
     """Evaluate the recorded strokes of the finger, and return the result of the last stroke.
 
-    strokes: durations of the strokes up to now, s. Returns None if the bag does not yet contain the
-    last stroke. The results of all strokes are written to a file and drawn.
+    The results of all strokes are written to a file and drawn. Return None if the bag does not yet
+    contain the last stroke.
+
+    strokes: durations of the strokes up to now, s.
     """
     if not is_path_recorded(bag, stroke.stroke_label(strokes[-1])):
         return None
@@ -131,7 +133,7 @@ def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
 def evaluate_path(bag: Path, label: str) -> DemoResult | None:
     """Evaluate the finger path that has the given label.
 
-    Returns None if the bag does not yet contain the path.
+    Return None if the bag does not yet contain the path.
     """
     if not is_path_recorded(bag, label):
         return None
@@ -152,9 +154,9 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
 
 
 def evaluate_images(bag: Path, count: int) -> DemoResult | None:
-    """Draw the images of the simulated eye in the first `count` simulated cases of IMAGES.
+    """Draw the images of the simulated eye for the first `count` entries of IMAGES.
 
-    Returns None if the bag does not yet contain the images of all these cases.
+    Return None if the bag does not yet contain the images of all these entries.
     """
     images, rows = image.read_images(bag), []
     for series, value, corrections in IMAGES[:count]:

@@ -47,7 +47,7 @@ from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
 
 TableMethod = Literal["quick_table", "nonlinear_table"]
 TABLE_METHODS: tuple[TableMethod, ...] = get_args(TableMethod)
-"""The methods that use a table, in order of increasing precision."""
+"""The methods that use a table, in order of increasing accuracy."""
 
 READ = (
     "twin/finger",
@@ -70,7 +70,7 @@ SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 EYE_PIXELS_EVERY = 9
-"""The number of frames from one frame that contains pixels to the next such frame.
+"""The number of frames from one frame with pixels to the next.
 
 The number is odd, so that frames with pixels alternate between both eyes.
 """
@@ -95,7 +95,7 @@ PROGRESS_PERIOD_S = 5.0
 
 @dataclass(slots=True)
 class Waiter:
-    """A wait for a condition until a deadline, which frames from the renderer can postpone.
+    """A wait for a condition, with a deadline that frames from the renderer postpone.
 
     seconds: time (s) to wait after the start, and after each frame that postpones the deadline.
     latest_s: latest deadline, in the time of the event loop.
@@ -128,7 +128,7 @@ class Driver:
         pids: Callable[[], Mapping[str, int]] = dict,
         publish_scene: Callable[[Scene], int] | None = None,
     ) -> None:
-        """Store the arguments; `async with` connects the driver to the graph.
+        """Create a driver; `async with` connects it to the graph.
 
         pids: function that returns the process id of each running node, for measurements.
         publish_scene: function that publishes a new scene, and returns the source timestamp of the
@@ -251,10 +251,10 @@ class Driver:
     def make_timeout_error(
         self, what: str, error: type[ExperimentError] = ExperimentError
     ) -> ExperimentError:
-        """Return the error of a wait that took too long, with the nodes' notes.
+        """Return the error of a wait that took too long; its text contains the notes of the nodes.
 
         what: first part of the error text. error: type of the error, unless a computer is
-        overloaded.
+            overloaded.
         """
         busy = [text for host in self._hosts.values() if (text := describe_busy(host))]
         notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
@@ -423,7 +423,7 @@ class Driver:
 
 
 def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
-    """Return whether a solver node uses a table for a scene and computes a missing table."""
+    """Return whether a solver node uses a table for a scene, and computes a missing table."""
     method, _ = choose_method(
         scene,
         parameters.method,

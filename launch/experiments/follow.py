@@ -77,8 +77,7 @@ DIRECTIONS = np.array(
     [one for one in product((-1.0, 0.0, 1.0), repeat=3) if any(one)], dtype=np.float64
 )
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-"""The unit vectors (26, 3). A vector's largest component along them is at least 0.91 of its length.
-"""
+"""Unit vectors (26, 3). A vector's largest component along them is at least 91 % of its length."""
 
 SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
 SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
@@ -173,10 +172,7 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the sparse matrix (steps - order, steps) that computes finite differences in time.
-
-    steps: number of time steps. order: order of the differences.
-    """
+    """Return the sparse matrix (steps - order, steps) that computes finite differences in time."""
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 
@@ -221,7 +217,7 @@ class RolledSheet:
 
 
 class FollowedContact:
-    """A model of the sheet's motion that follows a finger exactly, and of small deviations."""
+    """A model of a sheet that follows a finger exactly, and of small deviations from its motion."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))
@@ -238,9 +234,9 @@ class FollowedContact:
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
-        """Return the sheets after rolling over the object to each finger position.
+        """Return the sheet after it has rolled over the object to each of n finger positions.
 
-        positions_world: n finger positions (n, 3), m. The sheet starts at the front of the object.
+        positions_world: finger positions (n, 3), m. The sheet starts at the front of the object.
         """
         object_from_world = inverse(self._world_from_object)
         front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))
@@ -334,8 +330,8 @@ def bound_errors(
     """Return a lower bound of the contact error for a finger path, in mm.
 
     The result contains the mean and the 95 % quantile (p95) for the motion with the least mean.
-    Only time steps in which the finger touches the object are included. The error is counted as
-    zero in steps in which the arms cannot reach the exact pose, and in windows that have no
+    Only time steps in which the finger touches the object are included. The error counts as zero
+    where the arms cannot reach the exact pose, and in windows with fewer than 3 steps or no
     solution.
 
     times_s: n increasing times.

@@ -46,8 +46,7 @@ class ReferenceForceCurve:
         self._uncertainty = np.array(curve["uncertainty_ratio"])
 
     def force(self, depth_m: float) -> ReferenceForce | None:
-        """Return the force at a depth, or None if the depth is outside the depth range of the
-        curve.
+        """Return the force at a depth, or None if the depth is outside the range of the curve.
 
         A depth is accepted if it exceeds a limit of the range by at most 1 % of the limit.
         """
@@ -62,8 +61,7 @@ class ReferenceForceCurve:
 def find_reference_curve(
     scene: Scene, along_m: float, around_m: float, file: Path = REFERENCE_FILE
 ) -> ReferenceForceCurve | None:
-    """Return the stored curve for a position on the object of a scene, or None if no curve is
-    stored.
+    """Return the stored curve for a position on a scene's object, or None if there is none.
 
     along_m: position along the axis.
     around_m: arc length from the side that faces the user.

@@ -74,7 +74,7 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
     """Return a finger path in the scene of a launch file.
 
     name_or_file: name of a gesture, or CSV file with a recorded path.
-    settings: settings of the launch file, as in `load_graph`. "scene=FILE" replaces the scene.
+    settings: launch settings "node.parameter=value". "scene=FILE" replaces the scene.
 
     Raises ExperimentError if the path is unknown or invalid.
     """
@@ -143,8 +143,8 @@ class TrueFinger:
 class GestureRecording:
     """The data of recorded gestures, read from a bag; all times are in ns on the same clock.
 
-    truth: true finger motion. fingertips: fingertip messages that were measured at the exposures
-        `times_ns`.
+    truth: true finger motion.
+    fingertips: fingertip messages that were measured at the exposures `times_ns`.
     windows_ns: start and end of each gesture.
     """
 
@@ -251,7 +251,7 @@ def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
 
     missing: number of exposures for which no fingertip was published.
     reasons: number of invalid fingertips for each reason.
-    jump: jumps between consecutive valid fingertips, see `jump_sigmas`.
+    jump: differences between the errors of consecutive valid fingertips.
     """
     begin_ns, end_ns = find_recorded(recorded.windows_ns, "gesture", name)
     exposures = recorded.truth.times_ns

@@ -47,8 +47,7 @@ from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface,
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 
 DEPTH_FRACTION = 0.3
-"""The push depth that the simulated hand intends, as a fraction of the scene's maximum push depth.
-"""
+"""The push depth that the hand intends, as a fraction of the scene's maximum push depth."""
 
 TAPS, TAP_M, TAP_LIFT_M = 6, 0.004, 0.012
 STROKE_M_PER_S, MODULATION_HZ = 0.035, 1.0
@@ -66,11 +65,11 @@ It is a tenth of the smallest force that a fingertip can perceive.
 
 
 def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:
-    """Return the finger motion of a push, a rest and a release.
+    """Return the finger motion of one press: push in, hold, lift off.
 
-    Returns n times (s) and n positions (n, 3), m, relative to the object's surface.
+    Return n times (s) and n positions (n, 3), m, relative to the object's surface.
 
-    hold_s, lift_s: durations of the rest and of the release.
+    hold_s, lift_s: durations of the hold and of the lift.
     """
     return minimum_jerk(
         (0.0, 0.0, HOVER_M),
@@ -109,12 +108,12 @@ def make_tap(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_hold(scene: Scene, depth_m: float) -> FingerPath:
-    """Return the path of a finger that pushes to `depth_m`, rests for 3 s, and lifts."""
+    """Return the path of a finger that pushes to `depth_m`, holds for 3 s, and lifts off."""
     return _make_path(scene, "hold", _press(depth_m, 3.0, 0.8))
 
 
 def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
-    """Return the path of a finger that pushes to `depth_m` and withdraws as fast as people do."""
+    """Return the path of a finger that pushes to `depth_m` and lifts off as fast as people do."""
     return _make_path(scene, "let-go", _press(depth_m, 1.5, 0.15))
 
 
@@ -172,8 +171,7 @@ HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
 class FeltForce:
     """The felt force and the object's force at the finger's depth.
 
-    times_s, depths_m, felt_n, wanted_n: arrays with one element per time step. `wanted_n` is the
-    force of the object.
+    Each array has one element per time step. `wanted_n` is the force of the object.
     """
 
     times_s: Floats

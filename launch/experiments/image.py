@@ -69,7 +69,7 @@ def push_path(
     along_mm: position along the axis, measured from the centre.
     tilt_deg: angle around the axis, measured from the front.
 
-    Raises ExperimentError if the position is outside the limits that the error text names.
+    Raises ExperimentError if the position is not on the cylinder, or more than 60° from its front.
     """
     cylinder = require_cylinder(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
@@ -150,7 +150,7 @@ def make_eyes_label(label: str, pattern: Pattern) -> str:
 
 
 def make_eye_key(label: str, viewpoint: Viewpoint) -> str:
-    """Return the key of an image in the result of `read_images`."""
+    """Return the key of an eye image in the result of `read_images`."""
     return label if viewpoint == "centre" else f"{label}, {viewpoint}"
 
 

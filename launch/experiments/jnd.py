@@ -41,9 +41,7 @@ from flexsheet.messages.files import make_write_error
 from flexsheet.nodes.arrays import Floats
 
 CRITERION = 0.75
-"""The fraction of correct answers if the increment equals the Weber fraction and there are no
-lapses.
-"""
+"""The fraction of correct answers at the Weber fraction if there are no lapses."""
 
 INCREMENTS = np.geomspace(0.02, 1.0, 25)
 WEBER_FRACTIONS = np.geomspace(0.02, 1.0, 81)
@@ -92,8 +90,7 @@ class StaircaseEstimator:
         self._posterior /= self._posterior.sum()
 
     def choose(self, stiffer: int) -> int:
-        """Return the index of the increment that gives the most information about the Weber
-        fraction.
+        """Return the index of the increment that is most informative about the Weber fraction.
 
         With this increment, the posterior after the answer has the least expected entropy.
 

@@ -59,8 +59,7 @@ class PairPresenter:
         driver.on_message = self._peaks.update
 
     async def present(self, trial: PairTrial) -> PairAnswer:
-        """Present the objects of a trial one after the other, and return the answer that the
-        operator types.
+        """Present both objects of a trial in sequence, and return the answer that is typed.
 
         Raises ExperimentError if the operator types "q".
         """

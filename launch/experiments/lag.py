@@ -20,8 +20,7 @@ def estimate_lag_s(
     leader_times_s: Floats | None = None,
     max_lag_s: float = 0.15,
 ) -> float | None:
-    """Estimate the lag (s) of `follower` behind `leader`; the lag is negative if the follower is
-    ahead.
+    """Estimate the lag (s) of `follower` behind `leader`; negative if the follower is ahead.
 
     The lag maximizes the normalized cross-correlation over all axes. The leader is interpolated by
     a cubic spline and shifted. Samples of the follower are omitted if the leader does not cover
@@ -97,5 +96,4 @@ def _to_rows(values: Floats) -> Floats:
 
 
 def _compute_rms(values: Floats) -> float:
-    """Return the root mean square of the lengths of n vectors (n, k)."""
     return float(np.sqrt((values**2).sum(axis=1).mean()))

@@ -120,7 +120,7 @@ class Evaluation:
     expected_n: Floats | None = None
 
     def figures(self) -> dict[str, float | None]:
-        """Return a summary with one number per metric.
+        """Return the error of each metric, by the name of the metric.
 
         The image error is a root mean square in mm. The force error is a mean absolute relative
         error in percent. The errors of sheet and fingertip are mean lengths in mm.
@@ -565,11 +565,10 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return the shift (rows, columns, 2), m, of object points on the screen if the eye is at
-        `eye`.
+        """Return the shift (rows, columns, 2), in m, of each pixel's object point on the screen.
 
-        The pixels are the same as in `_object_points`. The shift is NaN if the ray of a pixel
-        misses the object.
+        The shift results from moving the eye from the scene's position to `eye`. It is NaN if the
+        ray of a pixel misses the object.
         """
         on_screen, points = self._object_points
         to_screen = eye[2] / (eye[2] - points[..., 2:])

@@ -23,9 +23,7 @@ EVENTS = tuple(event for event in LatencyEvent if event is not LatencyEvent.LIGH
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)
-"""The drawn part of the eye's image, as fractions of its size; outside this part, the image is
-dark.
-"""
+"""The drawn part of the eye's image, as fractions of its size; the remainder is dark."""
 
 CORRECTION_NAMES = {
     "none": "not corrected",
@@ -114,9 +112,7 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
 
 
 def draw_latency(recording: StrokeRecording, path: Path) -> None:
-    """Draw the latencies from exposure to each event, as medians and as ranges between the 1 % and
-    99 % quantiles.
-    """
+    """Draw the median and the 1 % and 99 % quantiles of the latency from exposure to each event."""
     events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
     figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
     axes = figure.subplots()
@@ -190,9 +186,7 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_stability(result: dict[str, Any], path: Path) -> None:
-    """Draw the fraction of stable hands against stiffness and delay, with one panel per control
-    loop.
-    """
+    """Draw the fraction of stable hands against stiffness and delay, one panel per control loop."""
     rows = [*result["rows"], *result["without_bounds"]]
     kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})

@@ -134,7 +134,7 @@ def run_robustness(
 
 
 def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
-    """Compare the errors that reports of simulated laboratories predict with the true errors.
+    """Compare the errors that the reports of simulated laboratories predict with the true errors.
 
     confusion: number of laboratories for each combination of report (good or not) and true errors
         (within tolerance or not), in total and for each metric.

@@ -155,9 +155,9 @@ async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
 
 
 def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """Return the launch setting "NODE.parameter=value" for all nodes of a type.
+    """Return the launch setting "NODE.parameter=value" for all nodes of a type or a derived type.
 
-    Nodes of derived types are included. setting: text "parameter=value".
+    setting: text "parameter=value".
     """
     graph = load_graph(launch_file, needed=tuple(TOPICS))
     return [f"{node.name}.{setting}" for node in graph.nodes_of_type(node_type)]
@@ -263,8 +263,9 @@ def make_evaluation(
     """Make a procedure that evaluates a finished experiment while the graph still runs.
 
     evaluate: function that reads the bag and returns the result; None if the recorder has not yet
-    written the experiment. report: function that receives the result. name: name of the experiment
-    in the error text.
+        written the experiment.
+    report: function that receives the result.
+    name: name of the experiment in the error text.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:

@@ -69,9 +69,7 @@ TIMING = frozenset(
 """The parameters that have no effect at rest, or no effect on a noise-free image of the marker."""
 
 STROKE_SEEDS = (0, 1, 2)
-"""The random seeds of the finger's strokes. The simulations with nominal and with changed hardware
-parameters use the same seeds.
-"""
+"""The random seeds of the strokes, for nominal and for changed hardware parameters."""
 
 WITH_IMAGES = frozenset({"finger.marker_shape", "finger.marker_tilt_rad"})
 """The parameters that affect the detection of the marker, which requires rendered images."""
@@ -85,9 +83,7 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
 }
-"""The sections of the apparatus (true hardware parameters), with the metrics that the parameters of
-each section affect at rest.
-"""
+"""The metrics that are affected at rest, by section of the true hardware parameters."""
 
 
 def evaluation_of(parameter: str) -> EvaluationKind:
@@ -115,8 +111,8 @@ def run_sensitivity(
 ) -> dict[str, Any]:
     """Vary the parameters individually, and return the results of `experiment sensitivity --json`.
 
-    folder: folder in which the results of finished trials are stored. seconds: duration of a stroke
-    of the finger.
+    folder: folder in which the results of finished trials are stored.
+    seconds: duration of a stroke of the finger.
     """
     plan = load_graph(launch_file, settings=settings)
     scene = require_scene(plan)
@@ -192,7 +188,7 @@ def _make_row(
 def rank(scene: Scene, rows: Sequence[Row]) -> list[Row]:
     """Return the measured parameters, sorted by their worst effect at a deviation of one sigma.
 
-    The key `share` is the ratio of the effect to the scene's tolerance of the metric.
+    The key `share` is the effect divided by the scene's tolerance of the metric.
     """
     limits = metric_tolerances(scene)
     ranked = []

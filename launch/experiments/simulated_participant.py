@@ -13,9 +13,7 @@ from statistics import NormalDist
 import numpy as np
 
 SEED_STREAM = 75
-"""The second element of the random seed, which makes the seed different from the seed of the
-session.
-"""
+"""The second element of the random seed, so that the seed differs from the session's seed."""
 
 WEBER_RANGE = (0.08, 0.3)
 """The range of Weber fractions of simulated participants.

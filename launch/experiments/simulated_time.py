@@ -98,8 +98,7 @@ The arm bridges use the same values.
 """
 
 SETTLING_S = 2.0
-"""The time (s) for which the finger rests at the start of the path, so that the sheet can reach it.
-"""
+"""The time (s) for which the finger rests at the start, so that the sheet can reach it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,11 +146,10 @@ class MeasuredFinger:
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Measure the finger at a timestamp, and return n positions (n, 3), in m, of its predicted
-        path.
+        """Measure the finger at a timestamp, and return its predicted positions (n, 3), in m.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
-        timestamp, (3,). The images are exposed slightly later.
+            timestamp, (3,). The images are exposed slightly later.
         """
         truth, random = self._truth, self._random
         late_s = truth.stamp_offset_s - self._stamp_offset_s
@@ -203,12 +201,10 @@ class FilmedFinger:
         return Header(1, at_ns, at_ns, "virtual", "camera", 1)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Take images of the finger at a timestamp, and return its predicted path.
-
-        The path consists of n positions (n, 3), in m.
+        """Take images of the finger at a timestamp, and return its predicted positions (n, 3), m.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
-        timestamp, (3,).
+            timestamp, (3,).
         """
         late_s = self._truth.stamp_offset_s
         if self._truth.exposure_jitter_s:
@@ -264,17 +260,13 @@ class SimulatedArm:
         self._now_s = 0.0
 
     def sheet_to(self, other: SimulatedArm) -> SheetMotion:
-        """Return the motion of the sheet between two arms, computed from joint angles as in an arm
-        bridge.
-        """
+        """Return the motion of the sheet between two arms, computed from their joint angles."""
         edges = [arm._geometry.world_from_edge(arm._servo.joints_rad) for arm in (self, other)]
         return self._geometry.sheet_between(*edges)
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge uses: a measured value, or a value known in
-        advance.
-        """
+        """Return the servo lag (s) that the bridge uses: measured, or known in advance."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property

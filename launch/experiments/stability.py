@@ -48,8 +48,7 @@ HAND_RANGES = {
     "wrist": ((0.1, 0.2), (100.0, 400.0), (0.15, 0.5)),
     "arm": ((0.5, 1.5), (100.0, 800.0), (0.15, 0.6)),
 }
-"""The ranges of mass (kg), stiffness (N/m) and damping ratio of random hands, for each kind of
-hand.
+"""The ranges of mass (kg), stiffness (N/m) and damping ratio of each kind of random hand.
 
 `nodes.models.hand_loop` lists the sources.
 """
@@ -73,8 +72,7 @@ At larger slopes, the finger loses contact with the sheet.
 
 SLOPES = 32
 FILTERS = ((math.inf, False), (math.inf, True), (10.0, False))
-"""The variants of the depth filter: its bandwidth (rad/s), and whether the depth is predicted over
-the delay.
+"""The depth filters: bandwidth (rad/s), and whether the depth is predicted over the delay.
 
 An infinite bandwidth means that the depth is not filtered.
 """
@@ -172,9 +170,7 @@ def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Fl
 
 
 def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[dict[str, Any]]:
-    """Return the simulated and the predicted critical slopes, with one row per hand and control
-    loop.
-    """
+    """Return simulated and predicted critical slopes, with one row per hand and control loop."""
     hands = draw_hands(settings.hands, settings.seed)
     rows: list[dict[str, Any]] = []
     for rate_hz, towards in product(settings.rates_hz, (True, False)):
@@ -280,7 +276,7 @@ def measure_map(
 def _simulate_pushes(
     fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop], jitter_s: float
 ) -> list[dict[str, Any]]:
-    """Return a table row for each hand and control loop.
+    """Simulate pushes, and return a table row for each hand and control loop.
 
     A row is marked as stable if the hand is stable at all depths.
     """

@@ -198,8 +198,9 @@ class SampledMotion:
 def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
     """Make a motion from samples (time in ns, value); sort them and drop repeated times.
 
-    name: name of the samples in the error text. Raises ExperimentError if there are fewer than two
-    samples.
+    name: name of the samples in the error text.
+
+    Raises ExperimentError if there are fewer than two samples.
     """
     if len(samples) < 2:
         raise ExperimentError(
@@ -222,8 +223,7 @@ class StrokeRecording:
         y axis and z axis of an edge in the world frame.
     delays_s: delays from the centre of an exposure to the events that it caused; the keys are the
         kinds of events.
-    drops: number of lost or refused messages. Messages that a `latest` reader skipped are not
-    counted.
+    drops: number of lost or refused messages, without those that a `latest` reader skipped.
     apparatus: origin of the true parameters of the simulated hardware.
     surface, true_surface: shape of the unloaded sheet according to the scene, and according to the
         apparatus.
@@ -372,9 +372,7 @@ def read_recording(bag: Path) -> StrokeRecording:
 
 
 def read_loads(bag: Path) -> tuple[tuple[int, bool], ...]:
-    """Return the times (ns) of the computers' load reports, and whether each computer was
-    overloaded.
-    """
+    """Return the times (ns) of the computers' load reports, and whether each states an overload."""
     return tuple(
         (header.source_ns, is_busy(message))
         for _, message, header, _ in BagReader(bag, topics=["host"])
@@ -484,8 +482,7 @@ def sheet_errors(
     shape: Shape | None = None,
     surface: SheetSurface | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return the sheet's errors delta d (n,) in m and delta theta (n,) in rad at n times
-    `times_ns`.
+    """Return the sheet's errors delta d (n,), in m, and delta theta (n,), in rad, at n times.
 
     The errors are relative to the surface at the commanded depth of the sheet. Therefore the push
     depth is not an error. On a cylinder, delta theta is the angle about its axis, as in Furukawa et
@@ -646,8 +643,7 @@ def compute_arcs(
 ) -> Floats:
     """Return arc lengths (n, 2), in m, around the cylinder at n times.
 
-    The first column belongs to the contact line of the sheet. The second column belongs to
-    `points`.
+    The columns belong to the contact line of the sheet and to `points`.
 
     edges: motions of both clamped edges.
     points: n points (n, 3), m, in the world frame.
@@ -665,8 +661,7 @@ def _compute_angles(scene: Scene, points: Floats) -> Floats:
 
 
 def tangential_distance(scene: Scene, points: Floats, others: Floats) -> Floats:
-    """Return the distances (n,), in m, between n pairs of points that are projected on the
-    cylinder.
+    """Return the distances (n,), in m, between n pairs of points projected onto the cylinder.
 
     points, others: (n, 3). Distances along the cylinder's axis are ignored.
     """

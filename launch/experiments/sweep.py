@@ -106,9 +106,8 @@ def run_sweep(
 ) -> dict[str, Row]:
     """Run all trials that have no result row yet, and return the rows of all trials.
 
-    The keys are the names of the trials, in the order of `trials`.
-
-    A failed trial has a row with the key `error`, and does not stop other trials.
+    The keys are the names of the trials, in the order of `trials`. A failed trial has a row with
+    the key `error`, and does not stop other trials.
 
     trials: descriptions of the trials for the module `trial`, with trial names as keys.
     workers: number of simultaneous trials on this computer; ignored if a scheduler is given.

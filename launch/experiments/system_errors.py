@@ -58,17 +58,14 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 STROKE = "system stroke"
 TOUCH_M = 0.001
-"""The push depth (m) during the stroke of the finger, which keeps the finger in contact despite
-drift and tremor."""
+"""The push depth (m) during the stroke, which maintains contact despite drift and tremor."""
 
 STROKED_RATIO = 0.9
-"""The stroked part of the arc length that the finger can touch, as a fraction."""
+"""The stroked fraction of the arc that the finger can touch."""
 
 SAMPLE_S = 0.05
 MAX_STEP_RAD = 0.1
-"""The maximum phase difference of the oscillating finger stroke between two points of its path, in
-rad.
-"""
+"""The maximum phase difference (rad) of the stroke's oscillation between two path points."""
 
 APPROACH_S = 1.0
 WARM_UP_S = 0.5
@@ -82,10 +79,7 @@ The error map interpolates between their pixels.
 """
 
 FORCE_STEP_S, FORCE_REST_S = 1.0 / 60.0, 1.5
-"""The time step of the planner during a push, and the duration of rest before forces are evaluated.
-
-Both are in seconds.
-"""
+"""The planner's time step (s) in a push, and the rest (s) before forces are evaluated."""
 
 STAGES = ("fingertip", "planner and arms", "geometry of the arms")
 """The stages whose errors add up to the sheet's error.
@@ -99,8 +93,6 @@ def make_stroke(scene: Scene, seconds: float) -> FingerPath:
     """Return the path of a finger that strokes back and forth around the object.
 
     The maximum speed is the speed of the scene's working range.
-
-    seconds: duration of the stroke.
     """
     half_m = 0.5 * STROKED_RATIO * touchable(scene)[1]
     frequency_rad_per_s = scene.working_range.speed_m_per_s / half_m
@@ -224,7 +216,7 @@ class ErrorEvaluator:
 
 
 class RestingPush:
-    """A planned sheet motion for a finger that pushes and then rests."""
+    """A planner of the sheet's motion for a finger that pushes and then rests."""
 
     def __init__(
         self, scene: Scene, apparatus: Apparatus, calibrations: NodeCalibrations, body: SoftBody
@@ -287,8 +279,7 @@ def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
 
 
 def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:
-    """Split the sheet's error at n times into the errors (3, n, 3), in m, of the three stages
-    `STAGES`.
+    """Return the sheet's error at n times, split into errors (3, n, 3), in m, of the three STAGES.
 
     The total error is the difference of two points in the object's frame. The first is the object's
     point nearest to the true finger, moved inward by the commanded offset (n, 1). The second is the

@@ -184,10 +184,8 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
     """Return the changes of the display errors that deviations of one hardware parameter cause.
 
-    No graph is run.
-
-    If the trial has `stroke_seeds`, the errors are measured during strokes of the finger in
-    simulated time. Otherwise, they are measured at rest.
+    No graph is run. If the trial has `stroke_seeds`, the errors are measured during strokes of the
+    finger in simulated time. Otherwise, they are measured at rest.
     """
     plan = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
     scene, calibrations = require_scene(plan), NodeCalibrations.of(plan)

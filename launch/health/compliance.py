@@ -92,7 +92,7 @@ def compute_compliance(
     max_depth_m: float | None = None,
     bounds: OffsetBounds | None = None,
 ) -> Compliance:
-    """Compute the offsets of the sheet along its normal that render the object's force.
+    """Compute the compliance: the offsets along the sheet's normal that render the object's force.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.
@@ -120,7 +120,7 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """A risk of the control loop of sheet and hand, as found by `find_loop_risk`.
+    """A risk that `find_loop_risk` has found in the control loop of sheet and hand.
 
     delay_s: time from the measurement of a push depth until the sheet has moved.
     error_ratio: maximum relative error of the rendered force within the stability limits.

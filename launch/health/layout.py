@@ -52,7 +52,7 @@ TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
 
 VIEW_DISTANCE_M = 1.0
 DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
-"""Two contacts are duplicates if their positions (m) and unit normals differ by less than this."""
+"""The maximum differences of position (m) and unit normal between duplicate contacts."""
 
 ROLL_STARTS = 24
 """The approximate number of contacts from which the sheet rolls to other contacts."""
@@ -607,10 +607,7 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 
 def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index (n,) of the limit that each of n samples violates most.
-
-    The index is -1 if a sample violates no limit.
-    """
+    """Return the index (n,) of the limit that each of n samples violates most, or -1 if none."""
     return np.where(reach.reachable, -1, reach.binding)
 
 

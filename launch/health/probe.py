@@ -174,10 +174,7 @@ async def probe_port(address: str, port: int) -> Reachability:
 
 
 async def _connect(address: str, port: int) -> int:
-    """Try to connect to a TCP port.
-
-    Return 0 if the connection succeeds, otherwise the error number.
-    """
+    """Connect to a TCP port; return 0, or the error number if the connection fails."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)

@@ -1,7 +1,7 @@
-"""Define the groups of interchangeable methods whose errors are measured against the simulator.
+"""Define the method families whose errors are measured against the simulator.
 
-The groups are defined in the package `launch`, because only this package is allowed to import both
-the methods and the simulator.
+They are defined in the package `launch`, because only this package is allowed to import both the
+methods and the simulator.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def make_finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
 
 
 def _make_motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
-    """Return a finger motion with drift and tremor that begins at the first point of a path."""
+    """Return a finger motion, with wander and tremor, that begins at the first point of a path."""
     start = np.asarray(path.positions_world_m[0])
     motion = FingerMotion.resting(start, seed=1).followed_by(
         0.0,

@@ -22,10 +22,7 @@ SEED = 20261123
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return a list of all configuration names for each block.
-
-    Each list is in a different random order.
-    """
+    """Return, for each block, a list of all configuration names in random order."""
     random = np.random.default_rng(seed)
     return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
 

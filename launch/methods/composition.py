@@ -26,11 +26,8 @@ EQUAL_RATIO = 1.05
 """Two errors of the system are considered equal if their ratio is below this value."""
 
 EQUAL_DELAY_RATIO = 1.5
-"""Two latencies are considered equal if their ratio is below this value.
-
-The 95 % latency of one configuration varies by about this ratio between the blocks of `flexsheet
-chart system` on an idle computer.
-"""
+"""Two latencies are considered equal if their ratio is below this value. The 95 % latency of one
+configuration varies by about this ratio between the blocks of `flexsheet chart system`."""
 
 P95_OVER_RMS = 1.614
 """The 95 % quantile of the length of a 3D Gaussian vector, divided by the length's rms value."""
@@ -140,10 +137,7 @@ def _add_up(
 
 
 def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
-    """Return the error that each stage adds to a metric.
-
-    A stage is omitted if it adds no error to the metric.
-    """
+    """Return the error budget of a metric: the error of each stage that adds to the metric."""
     parts = {
         stage: option.spreads.get(metric, 0.0) + abs(option.biases.get(metric, 0.0))
         for stage, option in combination.items()
@@ -379,8 +373,8 @@ def _find_cheaper(
 ) -> Combination | None:
     """Return the cheapest untested combination that costs less than the best run.
 
-    Only combinations are considered that are predicted to be as good as the best run. Return None
-    if there is no such combination.
+    The combination must be predicted to be as good as the best run. Returns None if there is no
+    such combination.
 
     The errors of a method are worst-case errors, so the sum over all methods overestimates the
     errors of the system. The predictions are therefore multiplied by the ratio of measured to
@@ -403,7 +397,7 @@ def _find_cheaper(
 
 
 def _adds_miss(one: Combination, best: Combination, tolerances: Figures) -> bool:
-    """Return whether a method of a combination alone exceeds a tolerance, unlike the best one's.
+    """Return whether a method in `one` alone exceeds a tolerance that the method in `best` meets.
 
     A run of the graph does not contain all cases of the working range, so it cannot disprove this.
     """

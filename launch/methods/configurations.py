@@ -54,17 +54,13 @@ PAPER = Methods(
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
     compliance="stiffness",
 )
-"""The methods of Furukawa et al. 2007, sections III and IV.
-
-There is no tracking filter. The soft body is linear FEM, and the sheet is drawn as four triangles.
-Stiffness is rendered only by the stretch of the sheet.
-"""
+"""The methods of Furukawa et al. 2007, sections III and IV. There is no tracking filter. The soft
+body is linear FEM, and the sheet is drawn as four triangles. Stiffness is rendered only by the
+stretch of the sheet."""
 
 PAPER_PLANNER = {"prediction_horizon_s": 0.0}
-"""The parameters of the planner for the methods of Furukawa et al. 2007.
-
-These methods do not compensate the delay (section V-C).
-"""
+"""The parameters of the planner for the methods of Furukawa et al. 2007, which do not compensate
+the delay (section V-C)."""
 
 FINEST = NODE_DEFAULTS.model_copy(
     update={
@@ -162,10 +158,7 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""The name of the configuration with which other configurations are compared.
-
-This configuration runs twice in each block of measurements.
-"""
+"""The name of the configuration with which others are compared. It runs twice in each block."""
 
 CONTROL_AGAIN = "tuned, again"
 
@@ -190,9 +183,8 @@ def list_configurations(scene: Scene) -> list[Configuration]:
 def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
     """Return the configurations with the given names, and the control configuration.
 
-    If no name is given, return all configurations.
-
-    Raises ExperimentError if a name is unknown.
+    If no name is given, all configurations are returned. Raises ExperimentError if a name is
+    unknown.
     """
     known = list_configurations(scene)
     for name in names:
@@ -202,7 +194,7 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
-    """Write a copy of a launch file, and replace the scene in the copy.
+    """Write a copy of a launch file with another scene, and return its path.
 
     Relative paths become absolute in the copy, and recording is disabled.
     """

@@ -17,10 +17,7 @@ INK, DARK_INK = "#1f2328", "#e6edf3"
 """The colours of axes and text on light and on dark pages."""
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8c6bb1", "#7f7f7f")
-"""The colours of lines, which people with colour vision deficiency can distinguish.
-
-They are adapted from Okabe and Ito.
-"""
+"""The colours of lines, adapted from those of Okabe and Ito for colour vision deficiency."""
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,

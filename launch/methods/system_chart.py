@@ -49,16 +49,12 @@ NOMINAL = "errors-nominal"
 """The name of the trial that computes errors with hardware that does not deviate from the scene."""
 
 FIRST_SEED = 100
-"""The seed of the first random set of true hardware parameters; smaller seeds are reserved for
-development.
-"""
+"""The seed of the first random apparatus. Smaller seeds are reserved for development."""
 
 ORDER_SEED = 19
 FINGER_SEED = 5200
-"""The random seed of the finger's motion in the first block.
-
-Each further block uses the next seed. Other charts use different seeds.
-"""
+"""The random seed of the finger's motion in the first block. Each further block uses the next seed.
+Other charts use different seeds."""
 
 ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
 LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
@@ -119,7 +115,6 @@ def plan_trials(
     The first trials compute errors. The blocks follow, each with all configurations in random
     order.
 
-    blocks: number of blocks.
     seconds: duration of each stroke of the finger.
     apparatuses: number of random apparatuses (sets of true hardware parameters).
     """
@@ -255,10 +250,7 @@ def run_system_chart(
 
 
 def read_value(row: Row, key: str) -> float:
-    """Return the value at a dotted key of a result row, such as "sheet_mm.p95".
-
-    Return NaN if the value is missing.
-    """
+    """Return the value at a dotted key ("sheet_mm.p95") of a result row; NaN if it is missing."""
     found: Any = row
     for part in key.split("."):
         found = None if found is None else found.get(part)
@@ -392,7 +384,7 @@ def upper_limit(one: Interval) -> float:
 
 
 def scale(one: Interval, factor: float) -> Interval:
-    """Multiply a value and its interval by a factor, to convert the unit."""
+    """Multiply a value and the limits of its interval by a factor."""
     return Interval(one.value * factor, one.low * factor, one.high * factor)
 
 
@@ -411,10 +403,7 @@ def _median_by_key(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def worst_ratio(point: Mapping[str, Any]) -> Interval:
-    """Return the largest ratio of an error to its tolerance for a point of the chart.
-
-    Latencies are not considered.
-    """
+    """Return the largest ratio of an error (not a latency) to its tolerance for a chart point."""
     ratios = [
         Interval(**one)
         for key, one in point["tolerance_ratios"].items()

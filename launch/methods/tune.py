@@ -44,10 +44,8 @@ REPEATS = 10
 MARGIN = 0.2
 """The fraction of a tolerance that is reserved for errors in cases that were not measured."""
 TIE_RATIO = 1.1
-"""Two methods are considered equally fast if the ratio of their times is at most this value.
-
-If several methods are equally fast, the most accurate method is chosen.
-"""
+"""Two methods are considered equally fast if the ratio of their times is at most this value. The
+most accurate of equally fast methods is chosen."""
 
 Setting = str | dict[str, Any]
 
@@ -87,10 +85,7 @@ class Tunable:
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
-    """Return the scene settings of all methods that a `Literal` type names.
-
-    The types are defined in `messages.methods`.
-    """
+    """Return the scene settings of all methods that the `Literal` type `methods` names."""
     return {name: name for name in get_args(methods)}
 
 
@@ -136,11 +131,8 @@ TUNABLES = (
         required_key=MATERIAL,
     ),
 )
-"""The tunable method families in the order of tuning.
-
-The sheet shape precedes the image correction, because the settings of the correction depend on the
-sheet shape.
-"""
+"""The tunable method families in the order of tuning. The sheet shape precedes the image
+correction, because the settings of the correction depend on the sheet shape."""
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
@@ -226,10 +218,7 @@ class Choice:
 
     @property
     def spare_ratio(self) -> float:
-        """Return the fraction of the tolerance that the error leaves unused.
-
-        The result is negative if the error exceeds the tolerance.
-        """
+        """Return the unused fraction of the tolerance, negative if the error exceeds it."""
         return 1.0 - self.chosen.error / self.tolerance
 
     def explain(self) -> str:
@@ -358,10 +347,7 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
 
 
 def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
-    """Return a sort key for insufficient methods.
-
-    Methods with fewer cases outside their range come first.
-    """
+    """Return a sort key by which methods with fewer cases outside their range come first."""
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -374,8 +360,7 @@ def tune(
 ) -> list[Choice]:
     """Measure the methods of each family in `tunables` in order, and choose one method per family.
 
-    If a method family does not support the scene's shape, mesh or sheet, the exception of the
-    method family is passed on.
+    Raises the exception of a method family that does not support the scene's shape, mesh or sheet.
 
     margin: fraction of each tolerance that is reserved.
     """
@@ -643,7 +628,7 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice], unmet: 
 
     source: scene file.
     target: file to write. If it is a symbolic link, the file to which the link points is written.
-    unmet: as in `insert_choices`.
+    unmet: sentences for the generated comment about tolerances that are not met.
 
     Raises BadInputError if other parts of the scene would change, or if the target cannot be
     written.

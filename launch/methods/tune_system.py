@@ -136,9 +136,7 @@ def _make_option(
 def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
     """Return the largest finite absolute value over the measured points within the method's range.
 
-    Return 0 if there is no finite value.
-
-    value: function that returns the value of a point.
+    The result is 0 if there is no finite value.
     """
     found = [abs(value(point)) for point in points if point.in_range]
     return max((one for one in found if math.isfinite(one)), default=0.0)

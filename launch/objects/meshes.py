@@ -139,10 +139,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
 
 
 def _load_trimesh(path: Path) -> Any:
-    """Read a mesh file as a `trimesh.Trimesh`, and do not repair the mesh.
-
-    Raises MeshError if the file is invalid.
-    """
+    """Read a mesh file as an unrepaired `trimesh.Trimesh`; raise MeshError if it is invalid."""
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(
             f"the mesh format {path.suffix} is not supported; convert the file to "

@@ -16,7 +16,7 @@ from flexsheet.messages.scene import Lens, Mesh, Pose, Scene
 from flexsheet.messages.units import find_unit
 
 LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
-"""The types whose keys have a group of their own, because several other types contain them."""
+"""The types whose keys form separate groups, because several other types contain these types."""
 
 EFFECTS: Mapping[str, str] = {
     "name": "name in logs, bags and reports",
@@ -123,7 +123,7 @@ def list_groups() -> Iterator[KeyGroup]:
 
 
 def _variants(key: str, kind: type[BaseModel]) -> Iterator[KeyGroup]:
-    """Yield a group of keys for each type that the value of a key of the object can have.
+    """Yield the keys of each type of geometry or of support that an object can have.
 
     key: "geometry" or "support".
     """
@@ -178,10 +178,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def _single_model(annotation: Any) -> type[BaseModel] | None:
-    """Return the model type of an annotation `Model` or `Model | None`.
-
-    Returns None for all other annotations.
-    """
+    """Return the model of an annotation `Model` or `Model | None`; None for other annotations."""
     if get_origin(annotation) is Annotated:
         return None
     kinds = [one for one in (annotation, *get_args(annotation)) if isinstance(one, type)]

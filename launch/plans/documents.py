@@ -57,9 +57,7 @@ MAX_DEPTH = 50
 MAX_VALUES = 5000
 """The maximum number of values in a YAML file.
 
-The parser needs about one second to read this number of values.
-
-The largest shipped file contains 300 values.
+The parser needs about one second to read them. The largest shipped file contains 300 values.
 """
 
 OPENING_TOKENS = (

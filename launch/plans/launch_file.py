@@ -291,7 +291,6 @@ def apply_console(document: Document) -> None:
 
 
 def _find_role(type_name: object) -> NodeRole | None:
-    """Return the role of a node type, or None if its class has no role or cannot be imported."""
     try:
         return find_role(node_class(str(type_name)))
     except (UnknownNodeError, NodeImportError, TypeError):

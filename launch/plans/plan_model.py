@@ -104,7 +104,7 @@ class Writer(StrictModel):
         return self.tcp
 
     def source_for(self, host: str) -> Source:
-        """Return the writer's name and endpoint for a subscriber on `host`.
+        """Return the source (writer name and endpoint) for a subscriber on `host`.
 
         The source of a TCP connection also names the writer's host for authentication.
         """
@@ -241,7 +241,7 @@ class ResolvedGraph(StrictModel):
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
-        """Return the writers and endpoints of a topic for a subscriber on `host`."""
+        """Return the sources (writer names and endpoints) of a topic for a subscriber on `host`."""
         return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
 
     def may_reset_estop(self) -> tuple[str, ...]:

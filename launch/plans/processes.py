@@ -52,7 +52,6 @@ def check_processes(entries: list[NodeEntry], document: Document) -> None:
 
 
 def _may_share(bridge: NodeEntry, entry: NodeEntry) -> bool:
-    """Return whether a node is allowed to share a process with the node `bridge`."""
     if bridge.type is None or find_role(bridge.type) is not NodeRole.ARM_BRIDGE:
         return True
     if bridge.spec.shares_arm_process or bridge.parameters is None or entry.parameters is None:

@@ -160,10 +160,7 @@ class RosParticipant:
         return topic.latched or bool(self._writers[topic.name].get_matched_subscriptions())
 
     def write(self, topic: RosTopic, cdr: bytes) -> None:
-        """Publish a message on an advertised topic. Raises Ros2Error if this fails.
-
-        cdr: serialized message.
-        """
+        """Publish CDR bytes on an advertised topic. Raises Ros2Error if this fails."""
         from cyclonedds.core import DDSException
 
         kind = make_dds_type(topic.ros_type)

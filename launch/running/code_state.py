@@ -40,10 +40,7 @@ def read_git_state(directory: Path) -> str:
 
 
 def _has_changed_sources(listed: str) -> bool:
-    """Return whether the code has changed, according to the output of `git status --porcelain -z`.
-
-    listed: output of this command, with changed and untracked files.
-    """
+    """Return whether sources have changed, given the output of `git status --porcelain -z`."""
     entries = [entry for entry in listed.split("\0") if entry]
     return any(
         not entry.startswith(UNTRACKED) or Path(entry).suffix in SOURCE_SUFFIXES

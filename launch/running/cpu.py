@@ -35,14 +35,14 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Waits:
-    """A sample of the total waiting times (s) by process id, taken at the time `time_s`."""
+    """The total time (s) that each process has waited for a core until `time_s`, by process id."""
 
     time_s: float
     waited_s: dict[int, float]
 
 
 class CpuWatch:
-    """A monitor of waiting times and processor times over the last WINDOW_S.
+    """A monitor of the times that processes wait for cores and use cores, over the last WINDOW_S.
 
     Call `update` once a second.
 
@@ -68,8 +68,8 @@ class CpuWatch:
         is known.
 
         watched: process ids of the measured nodes by node name.
-        named: process ids of the nodes whose programs are reported by node name. If it is None,
-            these are the nodes in `watched`.
+        named: process ids by node name. Programs with these ids are reported by node name. If it is
+            None, `watched` is used.
         measure_programs: whether to list the running programs even if the computer is not
             overloaded.
         """
@@ -98,10 +98,7 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return the total waiting time (s) of the main thread of a process.
-
-        Returns None if the time is unknown.
-        """
+        """Return the main thread's total waiting time (s) for a core, or None if it is unknown."""
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:

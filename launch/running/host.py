@@ -52,7 +52,7 @@ STARVED_WAIT_RATIO = 0.8
 """The minimum fraction of time without a processor at which real-time priorities are withdrawn."""
 
 REASON_LENGTH = 1000
-"""The maximum number of characters of an e-stop's reason, so that it fits into every message."""
+"""The maximum length (characters) of an e-stop's reason, so that it fits into every message."""
 
 RESET_WITHIN_S = 5.0
 """The time (s) in which all arms must confirm the reset of an e-stop."""
@@ -307,7 +307,7 @@ class HostAgent:
     def _limit_real_time(self) -> None:
         """Withdraw the real-time priorities of this graph if another node gets no processor.
 
-        All ready nodes count, also those that normally wait.
+        All ready nodes are checked, including nodes of high niceness, which are expected to wait.
         """
         pids = self._pids()
         ready = {one.name for one in self._processes() if one.state == "ready"}
@@ -365,7 +365,7 @@ def _describe_estop(writer: str, reason: str) -> str:
 def make_output(
     publisher: Publisher, clock: Clock, *, writer: str, epoch: int, plan: str
 ) -> Output[Message]:
-    """Return an output that numbers and timestamps the messages of a publisher."""
+    """Return an output that adds sequence numbers and timestamps to messages and publishes them."""
     return Output(
         publisher.topic,
         clock,

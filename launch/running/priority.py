@@ -51,9 +51,10 @@ def find_real_time_priority(configured: int | None) -> int | None:
 
 
 def _may_set_real_time(priority: int) -> bool:
-    """Try to set a real-time priority on a temporary thread.
+    """Return whether a thread of this user may have a real-time priority.
 
-    The result depends on capabilities, limits and control groups together.
+    The function tries it with a temporary thread, because capabilities, limits and control groups
+    together determine the result.
     """
     with ThreadPoolExecutor(1) as pool:
         attempt = pool.submit(os.sched_setscheduler, 0, os.SCHED_RR, os.sched_param(priority))

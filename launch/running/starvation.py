@@ -25,10 +25,7 @@ class ProcessorTime:
 
     @classmethod
     def read(cls, process: int) -> Self | None:
-        """Read the counters of a process, or return None if the process has ended.
-
-        process: process id.
-        """
+        """Read the counters of the process with this id; return None if the process has ended."""
         try:
             run, wait, slices = Path(f"/proc/{process}/schedstat").read_text().split()
             stat = Path(f"/proc/{process}/stat").read_text()

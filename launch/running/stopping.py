@@ -66,13 +66,7 @@ class StopOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopAttempt:
-    """An attempt to stop the arms.
-
-    path: means by which the stop was sent.
-    receiver: name of the receiver.
-    outcome: result of the attempt.
-    after_ms: time from the first request to the outcome.
-    """
+    """An attempt to stop the arms; `after_ms` is the time from the first request to the outcome."""
 
     path: StopPath
     receiver: str

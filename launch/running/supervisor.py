@@ -219,10 +219,7 @@ class Child:
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy available output to the log, and report its lines.
-
-        Return False if there was no output.
-        """
+        """Copy available output to the log, and report its lines; return False if there is none."""
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -636,10 +633,7 @@ class RunningGraph:
         )
 
     async def _watch_keys(self) -> None:
-        """Detect changed keys in the launch file and the user's key files.
-
-        The changes are sent to the processes.
-        """
+        """Detect changed keys in the launch file and in key files; send them to the processes."""
         watch = KeyWatch(self.plan, self.run, self._rings)
         reported = ""
         while True:
@@ -693,10 +687,7 @@ class RunningGraph:
                 self.restarts[node.name] += 1
 
     async def _run_once(self, process: ResolvedProcess) -> str | None:
-        """Run a process until it ends.
-
-        Return a text about the failure of the process, or None if it did not fail.
-        """
+        """Run a process until it ends; return a text about its failure, or None if it succeeded."""
         child = await self._spawn(process)
         late = await self._is_late(child, process)
         if late:
@@ -743,10 +734,7 @@ class RunningGraph:
         self.exit_codes.update(dict.fromkeys((node.name for node in process.nodes), code))
 
     async def _detect_hang(self, child: Child, process: ResolvedProcess) -> bool:
-        """Monitor a process until it exits or hangs.
-
-        If it hangs, end the process and return True.
-        """
+        """Monitor a process until it exits or hangs; if it hangs, end it and return True."""
         liveness_s = process.settings.liveness_s
         if liveness_s is None:
             return False
@@ -797,7 +785,6 @@ class RunningGraph:
         return child
 
     def _environment(self) -> dict[str, str]:
-        """Return the environment variables of the nodes' processes."""
         assert self._lifeline is not None
         environment = {
             **os.environ,
@@ -888,7 +875,6 @@ def list_written_files(pid: int) -> list[Path]:
     try:
         entries = list(Path(f"/proc/{pid}/fd").iterdir())
     except OSError:
-        # The process has ended.
         return []
     files = []
     for entry in entries:
@@ -999,10 +985,7 @@ def _name_port_options(plan: ResolvedGraph, port: int) -> str:
 
 
 def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
-    """Check that all TCP ports of this launcher's processes are free.
-
-    Raises BadInputError if a port is in use.
-    """
+    """Raise BadInputError if a TCP port of this launcher's processes is in use."""
     needed = [
         (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))
         for topic, writers in plan.writers.items()

@@ -41,7 +41,7 @@ MAX_FIXED_ERROR_RATIO = 1.4
 The resulting maximum errors are 1.05 degrees and 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
-"""The maximum rotation (rad) of J4 or J1 in one step that only reduces the pose error near a
+"""The maximum extra rotation (rad) of J4 or J1 per step that reduces the pose error near a
 singularity. At 140 steps per second, this rotation corresponds to half the maximum speed of these
 joints."""
 
@@ -75,8 +75,7 @@ BRANCHES = tuple(
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
     """Return the rotation matrix (3, 3) of the forearm relative to the base.
 
-    joint_1: angle of J1 about the z axis, rad.
-    joints_23: sum of the angles of J2 and J3 about the y axis, rad.
+    joint_1, joints_23: angle of J1, and sum of the angles of J2 and J3, rad.
     """
     c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
     return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
@@ -85,13 +84,12 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
     """Return the angle (rad) by which an axis rotates to become parallel to a vector.
 
-    Near a singularity, the vector is short, and the axis may deviate from the vector.
-
     along, across: components of the vector parallel and perpendicular to the axis.
-    fixed: length of the vector at which the axis may deviate by 90 degrees.
-    near: minimum length of the vector at which the axis must not deviate.
+    fixed: length of the vector at which the angle between axis and vector may be 90 degrees.
+    near: length of the vector at which this angle must be 0.
 
-    In one step, the axis rotates by at most MAX_FREE_ROTATION_RAD more than necessary.
+    The vector is short near a singularity. The axis may then deviate from the vector, and rotates
+    by at most MAX_FREE_ROTATION_RAD more than necessary.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -120,7 +118,6 @@ def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
 
 
 def _wrap(angle: float) -> float:
-    """Return the equivalent angle in the range from -pi to pi (rad)."""
     return atan2(sin(angle), cos(angle))
 
 
@@ -195,9 +192,10 @@ class ClosedFormKinematics:
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return how far (m) n flange poses (n, 4, 4) are within the maximum reach, as (n,).
+        """Return the reach margins (n,), m, for n flange poses (n, 4, 4).
 
-        The value is negative if a pose is out of reach.
+        A margin is the maximum minus the actual distance between shoulder and wrist centre. It is
+        negative if the pose is out of reach.
         """
         wrist = base_from_flange[:, :3, 3] - self._flange_m * base_from_flange[:, :3, 2]
         away = np.linalg.norm(wrist - [0.0, 0.0, self._shoulder_m], axis=1)
@@ -243,13 +241,13 @@ class ClosedFormKinematics:
         return found
 
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Solve the inverse kinematics with the solution nearest to the present joint angles.
+        """Return the solution (6,) rad of the inverse kinematics nearest to the present angles.
 
         base_from_flange: flange pose (4, 4).
         present_rad: present joint angles (6,).
 
-        Returns joint angles (6,), rad. The nearest solution is the solution with the smallest
-        maximum joint change. Raises UnreachableError if no solution is within the joint ranges.
+        The nearest solution has the smallest maximum joint change. Raises UnreachableError if no
+        solution is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         nearest, least = None, inf
@@ -393,8 +391,7 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
-        near_rad: joint angles (6,). If angles differ by whole revolutions, the angle nearest to
-            `near_rad` is returned.
+        near_rad: joint angles (6,) that select among angles which differ by whole revolutions.
 
         The angles may exceed the joint ranges. They are NaN if a pose is out of reach.
         """
@@ -437,9 +434,10 @@ class ClosedFormKinematics:
         return joints
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) of joint angles (n, 6) rad for each kind of singularity.
+        """Return the margins (n,) to each kind of singularity at joint angles (n, 6) rad.
 
-        A margin is the distance from the singularity minus the permitted minimum distance.
+        A margin is the distance from the singularity minus the permitted minimum. The unit is m for
+        the shoulder, and rad for elbow and wrist.
         """
         joints = np.asarray(joints_rad, dtype=np.float64)
         elbow = np.remainder(joints[..., 2] - self.elbow_rad + 0.5 * pi, pi) - 0.5 * pi
@@ -451,7 +449,7 @@ class ClosedFormKinematics:
         }
 
     def _out(self, joints: Floats) -> Floats:
-        """Return the horizontal distance (m) of the wrist centre from the axis of J1.
+        """Return the horizontal distance (m) of the wrist centre in front of the J1 axis.
 
         joints: joint angles (..., 6), rad.
 

@@ -209,10 +209,7 @@ class ArmControl:
 
     @property
     def all_faults(self) -> tuple[str, ...]:
-        """Return the texts that the bridge sends to the other arm.
-
-        The texts describe faults, an e-stop and a lost connection.
-        """
+        """Return the texts about faults, an e-stop and a lost connection, for the other arm."""
         estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self._state is State.DISCONNECTED else ()
         return (*self.faults, *estop, *lost)
@@ -385,7 +382,6 @@ class ArmControl:
         self.handle(Event.ARM)
 
     def _inhibit(self, reason: str, event: Event = Event.INTERLOCK) -> None:
-        """Disarm the arm, and forbid arming for the given reason."""
         self._interlock_reason = reason
         self._disarm(reason, event)
 
@@ -422,7 +418,7 @@ class ArmControl:
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return the reason why motion is forbidden, or None if motion is permitted.
+        """Return the interlock (reason) that forbids motion, or None if motion is permitted.
 
         other: state of the other arm; None if the other arm's messages are late.
         """
@@ -503,9 +499,9 @@ class ArmControl:
         return clock_problem if clock_problem and not self.faults else None
 
     def _wait_for_arming(self, other: OtherArm) -> Command:
-        """Return the command while this arm or the other arm is not armed.
+        """Return the command that stops the arm because this arm or the other arm is not armed.
 
-        The command first stops the arm. If this arm is not armed, later commands slacken the sheet.
+        If this arm is not armed, the sheet is slackened after RELAX_DELAY_S.
         """
         self._waited_s += self._step_s
         if self.ready:
@@ -532,7 +528,6 @@ class ArmControl:
         return self._decelerate(reason)
 
     def _move_to_target(self, goal: Goal, other: OtherArm, measured: Floats) -> Command:
-        """Return the command that follows the target, or that waits for the path check."""
         self._waited_s = 0.0
         if not _is_valid(goal.motion):
             return self._latch_fault("sheet target is not a rigid pose")
@@ -546,8 +541,8 @@ class ArmControl:
     def _track_target(self, goal: Goal, sheet: SheetMotion, other: OtherArm) -> Command:
         """Return the command that moves the sheet towards its target.
 
-        The sheet decelerates if the target or the state of the other arm is late. The sheet also
-        decelerates if the planner or the other arm's bridge has ended.
+        The sheet decelerates if the target or the other arm's state is late, or if the planner or
+        the other arm's bridge has ended.
         """
         late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
         is_late = goal.planner_ended or other.ended or late_s > self._timeouts.hold_after_s
@@ -573,10 +568,7 @@ class ArmControl:
         return self._command_sheet(sheet, other)
 
     def _check_measurement(self, other: OtherArm | None, measured: Floats) -> None:
-        """Latch a fault if the measured joint angles lag behind the command or violate a limit.
-
-        measured: measured joint angles (6,) rad.
-        """
+        """Latch a fault if the measured joints lag behind the command or violate a limit."""
         if self.faults or self._state not in TRACKING:
             return
         violation = check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
@@ -836,12 +828,6 @@ class ArmControl:
         return Command(mode, bounded)
 
     def _is_at_command(self, measured: Floats) -> bool:
-        """Return whether the measured edge is near its commanded position.
-
-        measured: measured joint angles (6,) rad.
-
-        The maximum distance is MAX_RESTART_SHIFT_M.
-        """
         shift_m = self._geometry.bound_edge_shift_m(self.commanded_rad, measured)
         return shift_m <= MAX_RESTART_SHIFT_M
 
@@ -849,7 +835,7 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured))
 
     def _restart_refusal(self, measured: Floats) -> str | None:
-        """Return the reason why no motion may start, or None if a motion may start.
+        """Return why no motion may start, or None if a motion may start.
 
         measured: measured joint angles (6,) rad.
 

@@ -39,7 +39,7 @@ EDGE_SPEED_FRACTION = 0.95
 def make_kinematics(
     model: ClosedFormArm | JointChain,
 ) -> ClosedFormKinematics | NumericKinematics:
-    """Make the kinematics object for an arm model."""
+    """Create the closed-form or numerical kinematics of an arm model."""
     return (
         ClosedFormKinematics(model)
         if isinstance(model, ClosedFormArm)
@@ -111,7 +111,7 @@ class ArmGeometry:
         return self._cached_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
 
     def _solve_flange(self, joints_rad: tuple[float, ...]) -> Floats:
-        """Return the flange pose base_from_flange (4, 4), which is read-only.
+        """Return the flange pose base_from_flange (4, 4), read-only because it is cached.
 
         joints_rad: joint angles (6,) after correction of the encoder offsets.
         """
@@ -120,10 +120,7 @@ class ArmGeometry:
         return pose
 
     def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
-        """Return an upper bound (m) of the edge's motion between two sets of joint angles.
-
-        joints_rad, other_rad: the two sets of joint angles (6,).
-        """
+        """Return an upper bound (m) of the edge's motion between two sets of joint angles (6,)."""
         return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
@@ -206,12 +203,10 @@ class ArmGeometry:
     def check_limits(
         self, flange: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
     ) -> str | None:
-        """Describe the limit that the flanges or the sheet violate, or return None.
+        """Describe the limit that the flanges or the sheet violate; return None if there is none.
 
-        flange, other_flange: world poses (4, 4).
+        flange, other_flange: world poses (4, 4) of this arm's flange and of the other flange.
         slack_m: tolerance on the limits of the flange.
-
-        The result is None if no limit is violated.
         """
         return check_flange(flange, other_flange, limits, slack_m=slack_m) or check_sheet(
             flange @ self.flange_from_edge,
@@ -221,9 +216,9 @@ class ArmGeometry:
         )
 
     def relax_limits(self, flange: Floats, other_flange: Floats) -> SheetLimits:
-        """Widen the limits that the arms exceed, or nearly exceed, at the start of a motion.
+        """Return the limits, widened where the arms exceed, or nearly exceed, them at the start.
 
-        flange, other_flange: world poses (4, 4) at the start.
+        flange, other_flange: world poses (4, 4) at the start of a motion.
         """
         limits = self.sheet_limits
         edge = flange @ self.flange_from_edge

@@ -54,12 +54,12 @@ SEEDS = 256
 SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
-"""The value that |sin(d / 2)| must exceed for at least one joint if two solutions are distinct. The
-angle d is the difference between the solutions for this joint."""
+"""The value of |sin(d / 2)| above which two solutions are distinct. The angle d is the difference
+between the solutions for the joint at which |sin(d / 2)| is largest."""
 
 
 class UnreachableError(FlexsheetError, ValueError):
-    """An error for a flange pose that no permitted joint angles reach.
+    """The error raised if no permitted joint angles reach a flange pose.
 
     limit: "reach", "singularity", or the joint ("J1" to "J6") that is out of range in the nearest
         solution.
@@ -74,10 +74,7 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class SeedBranch(NamedTuple):
-    """A branch of an arm whose kinematics have no closed form.
-
-    One set of joint angles defines the branch.
-    """
+    """A branch of an arm without closed-form kinematics, defined by one set of joint angles."""
 
     seed_rad: tuple[float, ...]
 
@@ -165,9 +162,9 @@ class NumericKinematics:
         return self._chain.jacobian(joints_rad)
 
     def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
-        """Improve n sets of joint angles (n, 6), rad, for n flange poses (n, 4, 4) by Newton steps.
+        """Improve joint angles (n, 6), rad, for n flange poses (n, 4, 4) by Newton steps.
 
-        Returns the joint angles (n, 6) and the remaining errors (n,).
+        Returns the joint angles (n, 6) and the remaining pose errors (n,), m or rad.
         """
         joints = joints_rad
         for left in reversed(range(steps + 1)):
@@ -184,11 +181,11 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4), and the pose errors (n,).
+        """Solve the inverse kinematics for n flange poses (n, 4, 4) through intermediate poses.
 
-        joints_rad: joint angles (6,) at which the solution starts.
+        joints_rad: joint angles (6,) from which the intermediate poses start.
 
-        The solution proceeds through intermediate poses.
+        Returns the joint angles (n, 6), rad, and the pose errors (n,), m or rad.
         """
         start = self.forward(joints_rad)
         rotation = scipy.spatial.transform.Rotation
@@ -250,7 +247,7 @@ class NumericKinematics:
         return np.asarray(found)
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return all known solutions (6,), rad, of the inverse kinematics for a flange pose (4, 4).
+        """Return the solutions (6,), rad, of the inverse kinematics found for a flange pose (4, 4).
 
         The solutions are within the joint ranges. They are sorted by their distance from the start
         angles of the arm. The search starts from random joint angles, and may miss a solution.
@@ -290,7 +287,7 @@ class NumericKinematics:
     ) -> Floats:
         """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
-        near_rad: joint angles (6,) near the solution.
+        near_rad: not used, because the branch determines the joint angles.
 
         The angles are NaN if a pose is out of reach.
         """
@@ -302,16 +299,16 @@ class NumericKinematics:
         return float(self._chain.offsets_m.sum() + self._chain.flange_m)
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return how far (m) n flange poses (n, 4, 4) are within the maximum reach, as (n,).
+        """Return the reach margins (n,), m, for n flange poses (n, 4, 4).
 
-        The maximum reach is the sum of all link lengths. The value is negative if a pose is out of
-        reach.
+        A margin is the sum of all link lengths minus the distance of the flange from the base. It
+        is negative if the pose is out of reach.
         """
         away = np.linalg.norm(base_from_flange[:, :3, 3], axis=1)
         return np.asarray(self._max_distance_m - away)
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) between joint angles (n, 6) rad and the nearest singularities.
+        """Return the margins (n,) to the nearest singularities at joint angles (n, 6) rad.
 
         A margin is the smallest singular value of the Jacobian minus NEAR_SINGULAR_VALUE.
         """
@@ -328,10 +325,8 @@ class NumericKinematics:
 def _pose_errors(wanted: Floats, present: Floats) -> Floats:
     """Return the pose errors (n, 6): translations (m) and rotation vectors (rad).
 
-    wanted, present: desired and present poses (n, 4, 4).
-
-    A pose error is the motion from the present pose to the desired pose. The directions of the
-    rotation vectors are exact. Their lengths are exact for small angles only.
+    A pose error is the motion from the present pose to the wanted pose (both (n, 4, 4)). The
+    directions of the rotation vectors are exact. Their lengths are exact for small angles only.
     """
     turn = wanted[:, :3, :3] @ np.swapaxes(present[:, :3, :3], 1, 2)
     spin = 0.5 * np.stack(

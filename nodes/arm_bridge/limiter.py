@@ -26,8 +26,8 @@ TOOL_SPEED_FRACTION = 0.82
 actual speed of an arm fluctuates (benchmarks/limiter.py)."""
 
 MAX_TRAVEL_STEP_S = 0.01
-"""The maximum duration (s) of the motion in one command. If the arm had to cover the motion of a
-longer gap between commands, it would exceed the tool speed."""
+"""The maximum duration (s) of the motion in one command. After a longer gap between two commands,
+the arm would otherwise exceed the tool speed."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
 """The minimum and the maximum duration (s) of a command. If the duration were shorter, rounding
@@ -214,7 +214,6 @@ def _clamp(values: Floats, lowest: Floats, highest: Floats) -> Floats:
 
 
 def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
-    """Return the highest speeds from which the joints can stop within the given distances."""
     return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_FRACTION * acceleration, step_s)
 
 
@@ -279,7 +278,7 @@ def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
 
 
 def measure_twist_rad(edge: Floats, other_edge: Floats) -> float:
-    """Return the angle (rad) of the rotation between two edges with the poses (4, 4)."""
+    """Return the twist (rad): the angle of the rotation between the poses (4, 4) of two edges."""
     # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2).
     apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
     return 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
@@ -320,12 +319,12 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Describe the violated limit of workspace or flange distance, or return None.
+    """Describe the violated limit of workspace or flange distance; return None if there is none.
 
     flange_world, other_flange: world poses (4, 4) of this arm's flange and of the other flange.
     slack_m: tolerance on both limits.
 
-    The result is None if no limit is violated. Values that are not finite violate both limits.
+    Values that are not finite violate both limits.
     """
     position = flange_world[:3, 3]
     lowest, highest = limits.workspace_min_m - slack_m, limits.workspace_max_m + slack_m
@@ -345,7 +344,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Describe a tracking error above the maximum; return None if no error is above it.
+    """Describe the tracking error if it exceeds its maximum; otherwise return None.
 
     joints_rad, measured_rad: commanded and measured joint angles (6,).
     """

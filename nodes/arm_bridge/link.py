@@ -25,14 +25,14 @@ _COUNTER_PERIOD = 2**32
 
 
 class ArmLinkError(FlexsheetError):
-    """An error for a failed exchange with an arm."""
+    """The error raised if an exchange with an arm fails."""
 
     code = "arm-link"
     remedy = "Check the arm's address, power, cable and program."
 
 
 class ArmSilentError(ArmLinkError):
-    """An error for an arm that does not accept a connection or does not answer in time."""
+    """The error raised if an arm does not accept a connection or does not answer in time."""
 
     code = "arm-silent"
     remedy = (
@@ -43,7 +43,7 @@ class ArmSilentError(ArmLinkError):
 
 
 class ArmRefusedError(ArmLinkError):
-    """An error for an arm that refuses a command."""
+    """The error raised if an arm refuses a command."""
 
     code = "arm-refused"
     remedy = (
@@ -53,7 +53,7 @@ class ArmRefusedError(ArmLinkError):
 
 
 class ArmAnswerError(ArmLinkError):
-    """An error for an answer that is damaged, invalid or intended for another command."""
+    """The error raised if an answer is damaged, invalid or intended for another command."""
 
     code = "arm-answer"
     remedy = (
@@ -230,7 +230,7 @@ class ConnectedLink(ABC):
     ) -> tuple[ArmStatus, tuple[int, ...]]:
         """Send one command, wait for its answer, and return the arm's status and counters.
 
-        mode, joints_rad: see `ArmLink`.
+        mode: `move`, `hold`, `stop` or `idle`, as in `ArmLink`.
         now_ns: time of the command.
 
         The first counter is the number of the controller's joint measurements. Raises

@@ -111,9 +111,8 @@ class ModbusStatus(ArmStatus):
 def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats) -> list[int]:
     """Encode a command block as a list of 16-bit registers.
 
-    joints_rad: joint angles (6,).
-
-    The sequence number and the time are encoded modulo 2^32.
+    The sequence number and the time are encoded modulo 2^32. Raises ValueError unless there are six
+    finite joint angles.
     """
     body = struct.pack(
         _COMMAND_FORMAT[:-2],
@@ -194,8 +193,8 @@ class ModbusLink(ConnectedLink):
     """A driver for one arm that uses one Modbus TCP connection.
 
     After a failure, the connection is closed if an answer may still arrive. Otherwise pymodbus
-    3.16.1 could return the late answer to the next request. The sequence number and the CRC detect
-    other wrong answers.
+    3.16.1 could return the late answer as the answer to the next request. The sequence number and
+    the CRC detect other wrong answers.
     """
 
     def __init__(self, host: str, port: int, *, timeout_s: float = 0.03) -> None:

@@ -96,9 +96,10 @@ class MotorForceEstimator:
         *,
         forward: Callable[[Floats], Floats],
     ) -> Force | None:
-        """Return the estimated force at `at_ns`, or None if the last estimate is too recent.
+        """Return the estimated force at `at_ns`.
 
-        For the other arguments, see `estimate_pull_n`.
+        For the other arguments, see `estimate_pull_n`. The result is None at the first call, and if
+        the last estimate is too recent.
         """
         before_ns, before_rad = self._last_ns, self._last_rad
         if before_ns is not None and at_ns - before_ns < PERIOD_NS:

@@ -1,4 +1,4 @@
-"""Convert and check the state message of the arm at the other edge of the sheet."""
+"""Represent and check the state of the arm at the other edge of the sheet."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class OtherArm:
 
     ready: whether the other arm is permitted to move.
     estop_engaged: whether the other arm's bridge has latched an e-stop.
-    agrees: whether the other arm follows a trajectory that overlaps with the trajectory of this
-        arm. The age of the state is then counted from the end of the other arm's trajectory.
+    agrees: whether the other arm follows a trajectory that overlaps with the own arm's trajectory.
+        The age of the state is then counted from the end of the other arm's trajectory.
     ended: whether the other arm's bridge has ended.
     """
 
@@ -55,10 +55,12 @@ class OtherArm:
         now_ns: int = 0,
         ended: bool = False,
     ) -> OtherArm:
-        """Convert a state message of the other arm's bridge.
+        """Create the state of the other arm from a message of its bridge.
 
         age_s: age of the message.
-        target_source_ns: time of the camera exposure for this arm's target.
+        target_source_ns: camera exposure from which the own arm's current target was computed.
+        now_ns: present time.
+        ended: whether the other arm's bridge has ended.
         """
         other_ns = state.target_source_ns
         ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)
@@ -95,15 +97,12 @@ class OtherArm:
 
     @property
     def estopped(self) -> bool:
-        """Return whether an e-stop is engaged, which forbids motion of both arms."""
+        """Return whether the other arm's e-stop is engaged, which forbids motion of both arms."""
         return self.mode == "estop" or self.estop_engaged
 
     @property
     def interlock_reason(self) -> str | None:
-        """Return the reason why the other arm's state forbids motion of this arm.
-
-        None means that the state permits motion.
-        """
+        """Return why the other arm's state forbids motion of the own arm; None if it permits it."""
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

@@ -232,7 +232,7 @@ def _find_duration_s(
 
 
 class PathChecker:
-    """A runner that checks one path at a time in a separate thread."""
+    """A checker of paths that runs one check at a time in a separate thread."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other

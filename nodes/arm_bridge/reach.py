@@ -108,7 +108,7 @@ class ArmReach:
 
     @property
     def binding(self) -> NDArray[np.intp]:
-        """Return the first violated limit of each pose, as indices (n,) into `LIMITS`.
+        """Return the first violated (binding) limit of each pose, as indices (n,) into `LIMITS`.
 
         The index is -1 for a pose that violates no limit.
         """
@@ -258,7 +258,7 @@ class PathStep:
 
 
 class PathError(FlexsheetError, ValueError):
-    """An error for a path that the arms cannot follow.
+    """The error raised if the arms cannot follow a path.
 
     limit: violated limit: a member of `LIMITS`, "jump" if joint angles would be discontinuous, or
         "alignment" if the arms cannot move to the path.
@@ -427,7 +427,7 @@ def _make_poses(motions: Sequence[SheetMotion]) -> SheetPoses:
 def _check_limits(left: ArmGeometry, right: ArmGeometry, track: Sequence[PathStep]) -> None:
     """Raise PathError if one of the poses of a path violates a limit.
 
-    A limit that is violated at the start may remain violated by the same amount.
+    A limit that is violated at the start may remain violated by the same amount, except at the end.
     """
     places = _make_poses([step.sheet for step in track])
     joints = (

@@ -47,10 +47,9 @@ class LatencyMean:
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Add an exchange with a new target, and ignore exchanges with the same target.
+        """Add an exchange; ignore it if it has the same target as the last one.
 
-        Returns the mean latency (s) after every REPORTED_TARGETS targets. In between, the result is
-        None.
+        Returns the mean latency (s) after every REPORTED_TARGETS targets, and None in between.
         """
         target, before = exchange.target, self._target
         self._target = target

@@ -53,7 +53,7 @@ def _monotonic_ms(real_time_ns: int) -> float:
 
 
 class CapturedDevice(ABC):
-    """A base class for captures that start their device on its first use.
+    """The base class of cameras that start their device on its first use.
 
     stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if the timestamp is unknown.
     wanted: requested value of each OpenCV property of the image format.
@@ -116,7 +116,7 @@ class CapturedDevice(ABC):
 
 
 class AravisCapture(CapturedDevice):
-    """A capture of a GenICam camera (GigE Vision or USB3 Vision) with the library Aravis.
+    """A GenICam camera (GigE Vision or USB3 Vision) that is read with the library Aravis.
 
     device: name of the camera; empty if there is only one camera.
     """
@@ -130,10 +130,7 @@ class AravisCapture(CapturedDevice):
         self._camera = self._call(lambda: self._aravis.Camera.new(device or None), "open")
 
     def _call(self, call: Any, what: str) -> Any:
-        """Call a function of Aravis. Raises DeviceError if the call fails.
-
-        what: name of the action in the error text, such as "start".
-        """
+        """Call a function of Aravis. If it fails, raise DeviceError with the action `what`."""
         try:
             return call()
         except Exception as error:  # GLib.Error, which is known only after the import.
@@ -213,7 +210,7 @@ class AravisCapture(CapturedDevice):
 
 
 class RealSenseCapture(CapturedDevice):
-    """A capture of the infrared pair of a RealSense camera, as one image with both views.
+    """A RealSense camera whose infrared image pair is read as one image with both views.
 
     device: serial number; empty if any camera may be used.
 
@@ -299,10 +296,7 @@ class RealSenseCapture(CapturedDevice):
         return True
 
     def _find_stamp_ms(self, frame: Any) -> float:
-        """Return the middle of the exposure as a time (ms) of the monotonic clock, or 0.
-
-        The result is 0 if this time is unknown.
-        """
+        """Return the mid-exposure time (ms) on the monotonic clock, or 0 if it is unknown."""
         rs = self._rs
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0.0
@@ -324,11 +318,11 @@ class RealSenseCapture(CapturedDevice):
 
 
 class GstreamerCapture(CapturedDevice):
-    """A capture of a GStreamer pipeline, which determines the image format and the controls.
+    """A camera that is read with a GStreamer pipeline.
 
     device: description of the pipeline up to raw video, such as `v4l2src device=/dev/video0`.
 
-    The source element of the pipeline provides the timestamps.
+    The pipeline determines the image format. Its source element provides the timestamps.
     """
 
     def __init__(self, device: str) -> None:

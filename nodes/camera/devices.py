@@ -28,7 +28,7 @@ MAX_RETRY_S = 30.0
 def open_reader(
     source: AnySource, camera: StereoCamera, now: Now, requested: Regions | None = None
 ) -> Reader:
-    """Open the source of a camera's images.
+    """Open a source of images, and return its reader.
 
     camera: camera of the scene.
     now: function that returns the current time (ns).
@@ -105,7 +105,7 @@ class ReaderThread(threading.Thread):
                 finally:
                     self._reader = None
                     reader.close()
-            except Exception as error:  # Drivers raise errors of many types.  Report and retry.
+            except Exception as error:  # Drivers raise errors of many types.
                 if self._stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):

@@ -176,11 +176,8 @@ class VideoReader(FileReader):
 class _LoopClock:
     """A clock whose time continues to increase when a file is read again from its start.
 
-    rate_hz: frame rate, which determines the interval between two passes if the file has a single
-        image.
-
-    Otherwise, the interval between two passes equals the interval between the last two images of
-    the file.
+    The interval between two passes equals the interval between the last two images of the file, or
+    1 / rate_hz if the file has a single image.
     """
 
     def __init__(self, rate_hz: float) -> None:

@@ -91,7 +91,7 @@ class EyeFilter:
     """A 1 euro filter for the positions of the eyes.
 
     min_cutoff_hz: cut-off frequency at rest.
-    cutoff_per_speed_hz: increase of the cut-off frequency per unit of speed.
+    cutoff_per_speed_hz: increase of the cut-off frequency with the speed, Hz per m/s.
     """
 
     def __init__(self, min_cutoff_hz: float, cutoff_per_speed_hz: float) -> None:

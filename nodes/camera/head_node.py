@@ -218,7 +218,7 @@ class FaceReader(threading.Thread):
             try:
                 detector = detector or load_detector(self._parameters.search_width_px)
                 self._read(detector)
-            except Exception as error:  # Drivers raise errors of many types.  Report and retry.
+            except Exception as error:  # Drivers raise errors of many types.
                 if self.stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):
@@ -227,7 +227,7 @@ class FaceReader(threading.Thread):
                 self.stopping.wait(self._parameters.retry_s)
 
     def _read(self, detect: Detector) -> None:
-        """Search images until the thread is stopped. Raises DeviceError if the camera fails."""
+        """Search images for eyes until the thread stops. Raises DeviceError if the camera fails."""
         p = self._parameters
         capture = open_capture(p.device)
         try:

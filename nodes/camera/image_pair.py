@@ -20,7 +20,7 @@ Now = Callable[[], int]
 
 
 class DeviceError(FlexsheetError, RuntimeError):
-    """An error for a device or file that cannot be read, or that delivers wrong image sizes."""
+    """Raised if a device or file cannot be read, or delivers images of a wrong size."""
 
     code = "device"
     remedy = (
@@ -153,7 +153,7 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 
 
 def describe_skew(skew_s: float, limit_s: float) -> str:
-    """Return a text that states why an image pair is rejected.
+    """Return the error text for an image pair that is rejected because of its skew.
 
     skew_s: time between the left and the right exposure.
     limit_s: maximum permitted time.

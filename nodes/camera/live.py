@@ -68,7 +68,7 @@ def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
 
 
 def open_device(device: int | str, api: str | None, backend: Backend | None) -> Any:
-    """Open a camera with the driver of a backend. Raises DeviceError if this fails.
+    """Open a camera with a backend. Raises DeviceError if this fails.
 
     The result has the interface of cv2.VideoCapture.
     """

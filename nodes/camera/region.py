@@ -40,9 +40,9 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
 def find_visible_region(
     points_camera: Floats, lens: Lens, width_px: int, height_px: int
 ) -> Region | None:
-    """Return the sensor region that shows all visible points among n points (n, 3), m.
+    """Return the sensor region that contains the images of all visible points, with a margin.
 
-    points_camera: points in the camera frame.
+    points_camera: n points (n, 3) in the camera frame, m.
 
     Returns None if no point is visible, and the full sensor if some points are behind the camera.
     The distortion polynomial is invalid beyond the image's corners. Points beyond the corners are

@@ -56,7 +56,7 @@ class Backend:
 
 
 BACKENDS = {
-    # V4L2_CID_EXPOSURE_ABSOLUTE has a unit of 100 us; V4L2_EXPOSURE_MANUAL is 1.  The driver fills
+    # V4L2_CID_EXPOSURE_ABSOLUTE has a unit of 100 us; V4L2_EXPOSURE_MANUAL is 1. The driver fills
     # one buffer while the other is read; with one buffer, it can drop every second frame.
     "v4l2": Backend(
         api=cv2.CAP_V4L2,
@@ -76,7 +76,7 @@ BACKENDS = {
         autos=(("auto white balance", cv2.CAP_PROP_XI_AUTO_WB),),
         offsets=(cv2.CAP_PROP_XI_OFFSET_X, cv2.CAP_PROP_XI_OFFSET_Y),
     ),
-    # The module `captures` opens the next three backends.  OpenCV opens the other backends.
+    # The module `captures` opens the next three backends. OpenCV opens the other backends.
     "aravis": Backend(exposure_unit_s=1e-6, whole_units=False, clock=True),
     "realsense": Backend(exposure_unit_s=1e-6, clock=True, stamp_fraction=0.0),
     "gstreamer": Backend(exposure_unit_s=1.0, whole_units=False, clock=True),

@@ -15,8 +15,8 @@ MAX_AGE_NS = 1_000_000_000
 several frame buffers need this time."""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
-"""The tolerance for the pairing of frames, as a fraction of the frame period. If there were no
-tolerance, jitter would drop frames of cameras that expose half a period apart."""
+"""The tolerance for the pairing of frames, as a fraction of the frame period. Without it, frames of
+cameras that expose half a period apart would be dropped because of jitter."""
 
 
 class StampCheck:

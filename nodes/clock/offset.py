@@ -85,7 +85,7 @@ def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float)
 
 
 def fit_drift(samples: list[Sample]) -> tuple[float, float]:
-    """Fit a line to the clock offsets by weighted least squares.
+    """Fit the drift: fit a line to the clock offsets by weighted least squares.
 
     Returns the value of the line at the newest sample, minus the offset of this sample (ns), and
     the slope of the line. The weights are the inverse squares of the half-widths of the samples'

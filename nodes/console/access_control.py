@@ -58,7 +58,7 @@ PageRequest = Callable[[Any, Request], Response | None]
 
 
 class ConsoleError(FlexsheetError, RuntimeError):
-    """An error that prevents the console from serving the page."""
+    """The error raised if the console cannot serve the page."""
 
     code = "console"
     remedy = "Choose another port, or set a token if the page is open to the network."
@@ -236,7 +236,7 @@ class PageConnection(ServerConnection):
         super().send_data()
 
     async def handshake(self, *arguments: Any, **rest: Any) -> None:
-        """Perform the opening handshake, and close the connection if the handshake is malformed."""
+        """Perform the opening handshake; after a malformed one, let the client disconnect."""
         try:
             await super().handshake(*arguments, **rest)
         except InvalidHandshake:

@@ -80,7 +80,7 @@ def compute_link_poses(
 
 
 def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
-    """Return the boxes that represent an arm.
+    """Return the pieces (boxes) that represent an arm.
 
     If `PIECES` does not describe the arm, each box connects two successive joints.
     """
@@ -102,7 +102,7 @@ def rounded_box(
 
     bevel: width of the bevel, divided by half of the shortest side.
 
-    The triangles are counter-clockwise.
+    The triangles are counter-clockwise as seen from outside.
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()

@@ -51,7 +51,7 @@ MAX_LABELS = 64
 
 
 class SceneController:
-    """Select and change the scene of the graph when viewers of the page request it."""
+    """A controller that selects and changes the scene of the graph when viewers request it."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class SceneController:
         first: Scene,
         sliders: Sliders | None = None,
     ) -> None:
-        """Start with the scene `first`.
+        """Create the controller with the scene `first`.
 
         publish: function that publishes a scene.
         folder: folder with the selectable scenes.
@@ -76,7 +76,7 @@ class SceneController:
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
-        """Change to another scene of the run; raise SceneChoiceError if the name is unknown."""
+        """Choose another scene of the run; raise SceneChoiceError if the name is unknown."""
         self.base, self.moved = scenes.load(self._folder, name), False
         self.sliders = Sliders.from_scene(self.base)
         self._send(self.base)
@@ -113,12 +113,12 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Build the object that converts mouse positions to points on the virtual object.
+        """Create the picker, which converts mouse positions to points on the virtual object.
 
         finger: controller that moves the finger to the selected points.
         failed: function that receives an error text if no points can be selected on the object.
 
-        The method returns before a background thread has built the object.
+        The method returns before a background thread has created the picker.
         """
         if self._picker_task is not None:
             self._picker_task.cancel()
@@ -148,7 +148,7 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """Request eye views, one at a time, because ray tracing takes a second of processor time.
+    """A requester of eye views. Only one is requested at a time, because ray tracing is slow.
 
     For each view, the renderer draws one frame and publishes its pixels. From this frame, the
     simulated eye computes the view. Afterwards, the previous display settings are restored. If no
@@ -288,10 +288,7 @@ class Replay:
         self.timeline, self.playing = None, False
 
     def seek(self, seconds: float) -> None:
-        """Jump to a time (s) since the start of the bag.
-
-        The time is limited to the bag's duration.
-        """
+        """Jump to a time (s) since the start of the bag, limited to the bag's duration."""
         if self.timeline is not None:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
@@ -321,7 +318,7 @@ class ConsoleFiles:
 
 
 class ReleaseError(FlexsheetError, ValueError):
-    """An error for a reset of an e-stop from a host that is not permitted to reset e-stops.
+    """The error raised if the console's host is not permitted to reset an e-stop.
 
     The text names the hosts that are permitted to reset the e-stop.
     """
@@ -334,7 +331,7 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """Publish e-stops, recordings and bookmarks, and save the state of the console.
+    """A controller that publishes e-stops, recordings and bookmarks, and saves the console's state.
 
     warn: function that receives an error text if the saved state cannot be used.
 
@@ -362,7 +359,7 @@ class ConsoleController:
         self.stopped: str | None = None
 
     def begin(self) -> None:
-        """Publish the latched messages again after a restart of the console.
+        """Publish the scene and a running recording again after a restart of the console.
 
         The messages of the previous console process were lost when it exited.
         """
@@ -392,10 +389,7 @@ class ConsoleController:
         self.save_state()
 
     def add_bookmark(self, label: str) -> str:
-        """Publish a bookmark, and return its label.
-
-        An empty label is replaced by a default label.
-        """
+        """Publish a bookmark, and return its label; replace an empty label by a default label."""
         label = label.strip() or DEFAULT_BOOKMARK
         self._publish(Bookmark(label=label))
         return label

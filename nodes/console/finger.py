@@ -101,7 +101,7 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Select points on a new virtual object from now on.
+        """Use another picker, because the virtual object has changed.
 
         picker: object that selects points on the virtual object; None if the shape is unknown.
         """

@@ -23,11 +23,7 @@ class History:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
 
     def add(self, now_s: float, source: MessageSource) -> None:
-        """Add a sample, and remove samples that are older than half a minute.
-
-        now_s: current time.
-        source: source of the messages.
-        """
+        """Add a sample at the time `now_s`, and remove samples older than half a minute."""
         self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()

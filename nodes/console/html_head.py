@@ -23,7 +23,7 @@ TITLE = b"<title>flexsheet console</title>"
 
 
 def inject_assets(response: Response) -> Response:
-    """Change the title, style and script of an HTML page; return other responses unchanged."""
+    """Inject title, style sheet and script into an HTML page; return other responses unchanged."""
     kind = response.headers.get("Content-Type", "")
     if response.status_code != 200 or not kind.startswith("text/html"):
         return response

@@ -24,7 +24,7 @@ class MessageSource(Protocol):
 
 
 class LatestMessages:
-    """Store the latest message of each topic, and decode a message only when it is read.
+    """A store of the latest message of each topic, which decodes a message only when it is read.
 
     refused: function that receives the topic and the error if a message cannot be decoded.
     """
@@ -38,7 +38,7 @@ class LatestMessages:
         """Store an encoded message, and return whether it replaces a message that was never read.
 
         name: name of the topic.
-        frames: encoded frames of the message.
+        frames: ZeroMQ frames (parts) of the encoded message.
         """
         unread = name in self._frames
         self._frames[name] = frames

@@ -60,7 +60,7 @@ NO_RECORDER = (
 
 
 class Operator:
-    """Connect the page with the running graph, in the event loop of the console node."""
+    """The connection of the page with the running graph, in the event loop of the console node."""
 
     def __init__(
         self,
@@ -263,10 +263,7 @@ class Operator:
         )
 
     def _solver_note(self) -> str:
-        """Return the note of the soft-body solver.
-
-        The result is empty if the solver has published the surface mesh.
-        """
+        """Return the note of the soft-body solver, or "" if it has published the surface mesh."""
         skin = self._live.latest("skin", Skin)
         if skin is not None and skin[1].source_ns >= self._sent_ns:
             return ""

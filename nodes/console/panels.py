@@ -66,10 +66,7 @@ def _mark(kind: tuple[str, str], text: str) -> str:
 def _table(
     caption: str, head: Iterable[str], rows: Iterable[Iterable[str]], *, numbers: Iterable[int] = ()
 ) -> str:
-    """Make an HTML table.
-
-    numbers: indices of the columns that contain numbers.
-    """
+    """Make an HTML table; `numbers` are the indices of the columns that contain numbers."""
     alignments = dict.fromkeys(numbers, ' class="fs-number"')
     heads = "".join(
         f'<th scope="col"{alignments.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)

@@ -28,13 +28,13 @@ rounds of this search. Each round tests the interval that the previous round fou
 
 
 class SurfacePicker:
-    """A selector of points on the object of a scene.
+    """A picker (selector) of points on the object of a scene.
 
     max_depth_m: maximum push depth of the working range.
 
-    If the object is a mesh, construction takes a second. Only points within the scene's working
-    range are selected. The tilt and the depth are limited. A point beyond the rim of the touchable
-    surface is replaced by a point before the rim.
+    If the object is a mesh, construction takes a second. Position, tilt and depth are limited to
+    the scene's working range. A point beyond the rim of the touchable surface, where the tilt is
+    permitted, is replaced by a point before the rim.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -73,7 +73,7 @@ class SurfacePicker:
     def offset_point(self, near: Floats, depth_m: float) -> Floats:
         """Return the point (3,), in m, at a depth below the touchable surface nearest to `near`.
 
-        near: point (3,), m.
+        near: point (3,) in the world frame, m.
 
         If the depth is negative, the result is above the surface.
         """

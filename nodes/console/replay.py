@@ -46,10 +46,7 @@ class Timeline:
         self.seconds = 0.0
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the last message of a topic at or before the selected time.
-
-        The result is None if there is no such message.
-        """
+        """Return the last message of a topic up to the selected time, or None if there is none."""
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:
@@ -100,7 +97,6 @@ class Timeline:
         return cached
 
     def _find_bookmarks(self) -> list[tuple[float, str]]:
-        """Return the time since the start (s) and the label of each bookmark in the bag."""
         found = []
         for i, time_ns in enumerate(self._positions.get("bookmark", ([], []))[0]):
             message, _ = self._open("bookmark", i)

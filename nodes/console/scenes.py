@@ -21,7 +21,7 @@ MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """An error for a scene that cannot be used."""
+    """The error raised if a scene cannot be used."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."

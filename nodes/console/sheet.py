@@ -67,7 +67,7 @@ def film(
     finger: position (x, y) of the finger, m.
     size_m: width and height of the film.
 
-    The deflection is relative to the depth of the finger, and it is 1 within `radius_m` of the
+    The deflection is divided by the depth of the finger, and it is 1 within `radius_m` of the
     finger. It solves Laplace's equation for a point force in an infinite strip. The Green's
     function of this problem follows from a conformal map. The free edges at y = +-height / 2 are
     represented by mirror images of the finger.
@@ -90,7 +90,7 @@ def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
 
     x, y: coordinates (n,) of n points.
 
-    The source is at (source_x, 0). The result is not normalized.
+    The source is at (source_x, 0). The function is 0 at both edges, and not normalized.
     """
     high = np.cosh(np.minimum(np.abs(y), 30.0))
     near = np.maximum(high - np.cos(x - source_x), 1e-12)
@@ -99,6 +99,6 @@ def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
 
 @lru_cache(maxsize=1)
 def _fractions() -> tuple[Floats, Floats]:
-    """Return the positions of the n grid vertices as fractions (n, 1) of width and height."""
+    """Return two arrays (n, 1): the fractions of width and height at which the n vertices are."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)

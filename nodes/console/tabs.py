@@ -274,7 +274,7 @@ class EyeTab:
 
 
 class RecordTab:
-    """The controls for recording and replay. The timeline is visible while a bag is shown."""
+    """The tab for recording and replay. The timeline is visible while a bag is shown."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._request = request

@@ -47,8 +47,7 @@ NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
 """The distances between the skin nodes of the reference meshes of two kinds. The finest mesh of
 each kind comes first. Focused meshes are fine only near the finger, and their spacing is in finger
-radii. Even meshes have the same spacing everywhere, in metres.
-"""
+radii. Even meshes have the same spacing everywhere, in metres."""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
@@ -98,8 +97,7 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the body with its linear method, and the precomputed model. If the model is not
-        cached, it is computed.
+        """Return the body with its linear method, and its precomputed model (cached if possible).
 
         spacing_m: distance between skin nodes.
         """
@@ -122,9 +120,7 @@ class SoftBodyBenchmark:
         return body, model
 
     def coarsest(self) -> SceneBody:
-        """Return the body with the linear method that has the largest distance between skin
-        nodes.
-        """
+        """Return the body with its linear method for the largest distance between skin nodes."""
         return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
 
     def sample(self) -> SamplePoint:
@@ -134,9 +130,7 @@ class SoftBodyBenchmark:
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return the name and the job (inputs of the computation) of each reference solution. The
-        most accurate solution comes first.
-        """
+        """Return the name and job (inputs) of each reference solution, most accurate first."""
         body, sample = self.coarsest(), self.sample()
         jobs = []
         for focused, even in zip(self.focused, self.even_m, strict=True):
@@ -149,10 +143,9 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return tables that cover only the skin near the push. The keys are the names of the
-        methods.
+        """Return tables that cover only the skin near the push, by name of the method.
 
-        A method is included only if its full table is not cached.
+        Methods whose full table is cached are omitted.
         """
         found = {}
         for name, spacing in self.table_m.items():
@@ -162,9 +155,7 @@ class SoftBodyBenchmark:
         return found
 
     def prepare(self, on_progress: Progress) -> None:
-        """Compute and cache all reference solutions and table snapshots. The first call takes
-        minutes.
-        """
+        """Compute and cache all reference solutions and table snapshots, which takes minutes."""
         jobs = [job for _, job in self.reference_jobs()]
         for table in self.local_tables().values():
             jobs += table.jobs
@@ -311,7 +302,7 @@ class ReferenceSet:
 
 
 def _ignore_progress(done: int, total: int) -> None:
-    """Do nothing. This progress callback is used where all results are in the cache."""
+    """Do nothing, because all results are in the cache."""
 
 
 def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
@@ -357,5 +348,4 @@ SOFT_BODY = _family([*LINEAR_SPACINGS_M, *TABLE_SPACINGS_M, NEWTON])
 SOFT_BODY_LINEAR = _family([*LINEAR_SPACINGS_M], table_m={}, newton_m=())
 SOFT_BODY_TABLES = _family([*TABLE_SPACINGS_M], linear_m={}, newton_m=())
 """The benchmarks of all methods (`SOFT_BODY`), of only the linear methods (`SOFT_BODY_LINEAR`) and
-of only the nonlinear tables (`SOFT_BODY_TABLES`). The precomputation of the tables takes minutes.
-"""
+only the nonlinear tables (`SOFT_BODY_TABLES`). The precomputation of the tables takes minutes."""

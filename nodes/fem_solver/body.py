@@ -36,20 +36,20 @@ FORCE_ERROR_RATIOS = {
     QUICK_TABLE: ((0.18, 0.10, 0.10, 0.10, 0.10, 0.10), (1.13, 0.76, 0.59, 0.46, 0.22, 0.22)),
     "nonlinear_table": ((0.17, 0.07, 0.03, 0.03, 0.03, 0.03), (1.13, 0.76, 0.15, 0.15, 0.15, 0.15)),
 }
-"""The relative force errors that the node reports for each method at the depths `ERROR_DEPTHS_M`.
+"""The estimated relative errors of each method's contact force at the depths `ERROR_DEPTHS_M`.
 
 The first row applies to cylinders on a strip support, for which the forces of a table are
 corrected. The second row applies to other bodies, whose tables use the linear response at small
 depths. The errors are valid for 95 % of the touchable nodes, for the finger of the demo and a skin
-spacing of 4.5 mm. The first row was measured by `python -m benchmarks.soft_body --table`.
-The second row is derived from the first row and was not measured.
+spacing of 4.5 mm. The first row was measured by `python -m benchmarks.soft_body --table`. The
+second row is derived from the first row and was not measured.
 """
 NOTED_DEPTHS_M = (0.001, 0.005)
-"""The push depths (m) for which the node's status message contains the error of the force."""
+"""The push depths (m) for which the node's status states the estimated force error."""
 
 
 def state_force_error_ratio(method: str, mesh: MeshSpec, depth_m: float) -> float:
-    """Return the relative force error that the node reports for a method and a push depth."""
+    """Return the estimated relative error of a method's contact force at a push depth."""
     corrected, uncorrected = FORCE_ERROR_RATIOS[method]
     on_strip = isinstance(mesh.geometry, Cylinder) and isinstance(mesh.support, StripSupport)
     return float(np.interp(depth_m, ERROR_DEPTHS_M, corrected if on_strip else uncorrected))
@@ -75,13 +75,13 @@ def make_soft_body_spec(
 
 
 def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
-    """Return the inputs of the computation of a body's nonlinear table."""
+    """Return the inputs from which the nonlinear table of a body is computed."""
     return TableSpec(spec, scene.finger.radius_m)
 
 
 @dataclass(frozen=True, slots=True)
 class SceneBody:
-    """A soft body of a scene, in its pose in the world.
+    """The soft body of a scene, at its pose in the world.
 
     method: method that computes the response. shape: surface of the body. spec: inputs of the
     precomputation. skin: skin mesh. front (3,): surface point nearest to the user, m, mesh frame.
@@ -129,9 +129,7 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response if the finger does not touch the object. The stiffness in this
-        response is the stiffness at the front of the object.
-        """
+        """Return the response without contact; its stiffness is that at the front of the object."""
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -142,7 +140,7 @@ class SceneBody:
         )
 
     def force_error_ratio(self, depth_m: float) -> float:
-        """Return the relative force error that the node reports for a push depth."""
+        """Return the estimated relative error of the contact force at a push depth."""
         return state_force_error_ratio(self.method.name, self.spec.mesh, depth_m)
 
     def message(
@@ -152,10 +150,10 @@ class SceneBody:
         horizon_s: float = 0.0,
         replaced: Sequence[SceneBody] = (),
     ) -> SoftBody:
-        """Convert a response to a message in the world frame.
+        """Return the message about a response, with vectors in the world frame.
 
         horizon_s: time from the camera exposure to the predicted fingertip position. replaced:
-        replaced bodies that still contribute to the response during a gradual transition.
+        earlier bodies that still contribute to the response during a gradual transition.
         """
         errors = [one.force_error_ratio(response.push_depth_m) for one in (self, *replaced)]
         rotation = self.world_from_mesh[:3, :3]
@@ -205,7 +203,6 @@ def build_scene_body(
         push_depth_m=scene.working_range.push_depth_m,
         drag=model.drag,
     )
-    # The point of the surface that is nearest to the user.
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
     away = 2.0 * float(np.ptp(rest, axis=0).max())
     front = shape.closest(middle + away * np.array(spec.mesh.towards_user)).point
@@ -286,9 +283,7 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
 
 
 def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
-    """Return the fingertip position (3,), m, world frame, predicted for the time `horizon_s` after
-    the exposure.
-    """
+    """Return the fingertip position (3,), m, world frame, `horizon_s` after the exposure."""
     return interpolate_path(
         fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s
     )[0]

@@ -95,7 +95,7 @@ def locate_sticking(
 def slide_anchor(
     shape: Shape, anchor: ContactAnchor, drag: Floats, fraction: float
 ) -> ContactAnchor:
-    """Return the anchor after the finger has slid over the surface.
+    """Return the anchor (pushed surface point) after the finger has slid over the surface.
 
     drag (3,): displacement of the finger from the anchor, m. fraction: fraction of this
     displacement that remains after the slide.

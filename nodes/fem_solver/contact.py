@@ -71,10 +71,9 @@ class DragResponse:
     """The response of a linear body to unit tangential forces on its skin.
 
     Young's modulus is 1 Pa. The body has m contact nodes, which the finger can touch, and s skin
-    nodes. tangents (m, 2, 3): two directions along the skin at each contact node.
-    compliance (2m, 2m): displacement along direction i (m) per force along direction j (N).
-    influence (2m, 3s), float32: displacement (m) of all skin nodes per force (N) along each
-    direction.
+    nodes. tangents (m, 2, 3): two directions along the skin at each contact node. compliance
+    (2m, 2m): displacement along direction i (m) per force along direction j (N). influence
+    (2m, 3s), float32: displacement (m) of all skin nodes per force (N) along each direction.
     """
 
     tangents: Floats
@@ -198,7 +197,7 @@ class SphereContact:
         young_modulus_pa: float,
         finger_radius_m: float,
     ) -> None:
-        """Sample the contact points of the skin.
+        """Distribute the contact points over the skin.
 
         shape: smooth surface, in the mesh frame, that the triangles in `response` approximate.
         """
@@ -288,8 +287,8 @@ class DragContact:
     """A solver of the tangential contact of a finger that sticks to the skin.
 
     Tangential springs connect the contact points to the finger. The stiffness of a spring is
-    proportional to the normal force at its point. Therefore the tangential forces start and end at
-    zero. They do not affect the normal forces.
+    proportional to the normal force at its point. Therefore the tangential forces are zero when
+    contact begins and ends. They do not affect the normal forces.
     """
 
     def __init__(
@@ -473,9 +472,7 @@ class LinearSoftBody:
         return np.column_stack([self._depths, self._weights(surface) @ self._corner_forces])
 
     def _weights(self, surface: Floats) -> Floats:
-        """Return Gaussian weights of the mesh corners for a surface point (3,). The weights add up
-        to 1.
-        """
+        """Return Gaussian weights of the mesh corners, with sum 1, for a surface point (3,)."""
         squared = np.square(self._points - surface).sum(axis=1)
         weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
         result: Floats = weights / weights.sum()
@@ -520,8 +517,7 @@ class LinearSoftBody:
 def unit_linear_body(
     response: SkinResponse, shape: Shape, bounds: Floats, finger_radius_m: float
 ) -> LinearSoftBody:
-    """Return the linear method for a Young's modulus of 1 Pa and a linear range of one finger
-    radius.
+    """Return the linear method for a modulus of 1 Pa and a linear range of one finger radius.
 
     bounds (b, 3): positions of the b skin nodes that must not be touched.
     """

@@ -40,7 +40,7 @@ class SchedulerError(precompute_table.WorkersError):
 
 
 class DaskExecutor(Executor):
-    """Execute functions on the workers of a dask scheduler, and cancel running functions."""
+    """An executor that runs functions on the workers of a dask scheduler, and can cancel them."""
 
     def __init__(self, client: distributed.Client) -> None:
         self._client = client

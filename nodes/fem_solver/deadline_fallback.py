@@ -13,7 +13,7 @@ SMOOTHING = 0.1
 
 
 class DeadlineFallback:
-    """A selector that chooses a method according to the durations of recent responses."""
+    """A selector of the soft-body method, according to the durations of recent responses."""
 
     def __init__(self, names: Sequence[str], budget_s: float) -> None:
         """Start with the first method of a list.

@@ -31,8 +31,7 @@ class SolidMeshError(FlexsheetError, ValueError):
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
     """Return Lame's constants lambda and mu, in Pa.
 
-    Raises ValueError unless Young's modulus is positive and Poisson's ratio is above
-    -1 and at most 0.4999.
+    Raises ValueError unless Young's modulus is positive and -1 < Poisson's ratio <= 0.4999.
     """
     if not (np.isfinite(young_modulus_pa) and young_modulus_pa > 0.0):
         raise ValueError(
@@ -48,11 +47,10 @@ def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float
 
 
 def quadrature() -> tuple[Floats, Floats]:
-    """Return the 8 quadrature points (8, 3) and their positive weights (8,) on the unit
-    tetrahedron.
+    """Return quadrature points (8, 3) and their positive weights (8,) on the unit tetrahedron.
 
-    The rule is exact for polynomials up to degree 3. Source: conical
-    product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
+    The rule is exact for polynomials up to degree 3. Source: conical product of Gauss-Jacobi rules
+    (Stroud, "Approximate Calculation of Multiple Integrals").
     """
     from scipy.special import roots_jacobi
 
@@ -68,9 +66,7 @@ def quadrature() -> tuple[Floats, Floats]:
 
 
 def shape_gradients(points: Floats) -> Floats:
-    """Return the gradients (q, 10, 3) of the shape functions at q points (q, 3) of the unit
-    tetrahedron.
-    """
+    """Return the shape function gradients (q, 10, 3) at points (q, 3) of the unit tetrahedron."""
     barycentric = np.column_stack([1.0 - points.sum(axis=1), points])
     slopes = np.vstack([-np.ones(3), np.eye(3)])
     corner = (4.0 * barycentric - 1.0)[:, :, None] * slopes
@@ -82,8 +78,7 @@ def shape_gradients(points: Floats) -> Floats:
 
 
 def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Floats]:
-    """Return the Jacobian matrices (e, q, 3, 3) of e elements at q points, and their determinants
-    (e, q).
+    """Return Jacobian matrices (e, q, 3, 3) and determinants (e, q) of e elements at q points.
 
     The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3):
     positions of the n nodes, m. elements (e, 10): node indices. local (q, 10, 3): gradients of the

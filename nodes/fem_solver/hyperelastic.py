@@ -164,9 +164,7 @@ class NeoHookeanSolid:
 
 
 def determinants(matrices: Floats) -> Floats:
-    """Return the determinants (...) of matrices (..., 3, 3). This function is faster than
-    `numpy.linalg.det`.
-    """
+    """Return the determinants (...) of matrices (..., 3, 3), faster than `numpy.linalg.det`."""
     a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
     result: Floats = (
         a[..., 0] * (b[..., 1] * c[..., 2] - b[..., 2] * c[..., 1])

@@ -1,5 +1,4 @@
-"""Factor the stiffness matrix of a mesh by a multifrontal Cholesky method. The matrix is given by
-element matrices.
+"""Factor a mesh's stiffness matrix, given as element matrices, by a multifrontal Cholesky method.
 
 Nested dissection bisects the set of elements recursively (George 1973). The degrees of freedom that
 two halves share are eliminated after the degrees of freedom inside the halves. The elimination of a
@@ -99,7 +98,7 @@ class _Part:
 
 
 class NestedDissection:
-    """An order of elimination that makes the factorization of a mesh's stiffness matrix fast."""
+    """The elimination order that makes the factorization of a mesh's stiffness matrix fast."""
 
     def __init__(self, nodes: Floats, elements: Ints, fixed: Bools) -> None:
         """Compute the elimination order.
@@ -129,11 +128,10 @@ class NestedDissection:
         self.fronts = [self._front(part) for part in self._parts]
 
     def factor(self, matrices: Floats) -> Factors:
-        """Factor the stiffness matrix that e symmetric element matrices (e, 3k, 3k) add up to.
+        """Factor the stiffness matrix, the sum of e symmetric element matrices (e, 3k, 3k).
 
-        float32 matrices need half of the time and memory of float64 matrices, but their
-        solutions have only about four digits. Raises IndefiniteError if the sum is not positive
-        definite.
+        float32 matrices need half of the time and memory of float64 matrices, but their solutions
+        have only about four digits. Raises IndefiniteError if the sum is not positive definite.
         """
         dtype = matrices.dtype
         trsm, syrk = scipy.linalg.get_blas_funcs(("trsm", "syrk"), dtype=dtype)
@@ -194,9 +192,7 @@ class NestedDissection:
         return len(self._parts) - 1, present, counts
 
     def _bisect(self, members: Ints) -> tuple[Ints, Ints]:
-        """Divide elements into two halves along the axis for which these halves share the fewest
-        nodes.
-        """
+        """Divide elements along the axis for which the two halves share the fewest nodes."""
         cuts = []
         for axis in range(3):
             order = members[np.argsort(self._centres[members, axis], kind="stable")]

@@ -346,9 +346,7 @@ class NeoHookeanBody:
         )
 
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
-        """Raise NewtonNotConvergedError if an element is inverted or the fingertip is inside the
-        body.
-        """
+        """Raise NewtonNotConvergedError for an inverted element or a fingertip inside the body."""
         ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
             raise NewtonNotConvergedError(
@@ -371,9 +369,7 @@ class NeoHookeanBody:
         target: Floats,
         factors: Factors | None,
     ) -> Floats:
-        """Predict the displacement (n, 3), m, to first order for a finger that moves to `target`
-        (3,).
-        """
+        """Predict to first order the displacement (n, 3), m, for a finger at `target` (3,), m."""
         if factors is None:
             return displacement
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)

@@ -37,11 +37,10 @@ BLEND_S = 5.0
 
 
 class FemSolver(Node):
-    """The node that publishes the undeformed skin of the object and the displacement that the
-    finger causes.
+    """A node that publishes the skin of the object and the displacement that the finger causes.
 
-    The skin is the surface of the object. The node publishes it once for each scene, and the
-    displacement once for each fingertip message.
+    The undeformed skin (surface) is published once for each scene, and its displacement once for
+    each fingertip message.
     """
 
     live_parameters: ClassVar[frozenset[str]] = frozenset(
@@ -80,11 +79,9 @@ class FemSolver(Node):
         self._anchor: ContactAnchor | None = None
 
     def _set_bodies(self, bodies: list[body.SceneBody]) -> None:
-        """Set the soft bodies that compute responses, and start a gradual transition to these
-        bodies.
+        """Set the soft bodies that compute responses, and start a gradual transition to them.
 
-        bodies: one body per method, of which the first is the best; an empty list if there is no
-            scene yet.
+        bodies: one body per method, the best one first; empty if there is no scene yet.
         """
         if bodies and self._bodies:
             self._replaced.append((self._bodies[self._fallback.name], self.clock.now_ns()))
@@ -96,9 +93,6 @@ class FemSolver(Node):
             self.note = f"soft body by {self._describe(bodies[0])}"
 
     def _describe(self, current: body.SceneBody) -> str:
-        """Return a text that states the current method, its force error and the number of skin
-        nodes.
-        """
         nodes = len(current.skin.vertices_world_m)
         bodies = (current, *(old for old, _ in self._replaced))
         errors = " and ".join(
@@ -155,7 +149,7 @@ class FemSolver(Node):
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
         """Compute the nonlinear table in the background, and use it when it is finished.
 
-        Until then, the linear method computes the responses, and later a coarse table.
+        Until then, the linear method computes the responses, and later the coarse table.
         """
         loop = asyncio.get_running_loop()
         stop = self._stop

@@ -48,10 +48,7 @@ about the required resources. The first call is before the work starts. The call
 
 
 class Interrupted(Exception):
-    """Raised when a computation is stopped on request.
-
-    The finished parts of the computation remain stored.
-    """
+    """Raised when a computation is stopped on request. Its finished parts remain stored."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +81,8 @@ class SoftBodyModel:
     """The precomputed elastic response of a soft body and its skin mesh.
 
     response: response to normal forces. triangles (t, 3): skin triangles with outward normals.
-    bounds (s,): whether the finger must not touch each of the s skin nodes; false for nodes on end
-    faces. drag: response to tangential forces; None if the finger does not stick to the skin.
+    bounds (s,): true for each skin node that the finger must not touch, except on end faces. drag:
+    response to tangential forces; None if the finger does not stick to the skin.
     """
 
     response: SkinResponse
@@ -138,8 +135,7 @@ def compute_budget(
 
 
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
-    """Estimate the resources that a precomputation needs. The mesh is not built, and the error is
-    at most a factor of two.
+    """Estimate the resources of a precomputation within a factor of two, without meshing.
 
     Raises UnfitMeshError if the skin spacing does not fit the object or requires too many nodes.
     """
@@ -294,13 +290,11 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""The names of the arrays in the cache file whose names differ from the field names. The keys are
-the field names.
-"""
+"""The names of arrays in the cache file that differ from the field names, which are the keys."""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
-    """Describe how the linear response of a soft body is stored in the cache."""
+    """Return the cache key of a linear response, and its conversion to arrays and back."""
 
     def encode(model: SoftBodyModel) -> dict[str, NDArray[Any]]:
         content = {"triangles": model.triangles, "bounds": model.bounds}

@@ -56,8 +56,7 @@ T = TypeVar("T")
 VERSION = 5
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""The progress steps that are added for each finished snapshot, and for each finished table node.
-"""
+"""The numbers of progress steps for each finished snapshot and for each finished table node."""
 POLL_S = 0.2
 """The period of progress reports and stop checks while snapshots are solved, in seconds."""
 SNAPSHOT_BYTES = 600_000_000
@@ -139,7 +138,7 @@ def code_version() -> str:
 
 
 def make_table_cache(spec: TableSpec) -> Specification[Table]:
-    """Describe how a nonlinear table is stored in the cache."""
+    """Return the cache key of a nonlinear table, and its conversion to arrays and back."""
     return Specification(
         "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
     )
@@ -258,11 +257,10 @@ def _compute_table(
 def _interpolate_by(
     executor: Executor, on_progress: Callable[[int, int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the snapshots at the nodes of all jobs with an executor. Return the results in
-    the order of the jobs.
+    """Interpolate the snapshots of all jobs by an executor; return results in the jobs' order.
 
-    on_progress: function that receives the number of finished nodes and the total number of nodes.
-        Nodes that are mirror images of other nodes are in no job.
+    on_progress: function that receives the number of finished nodes and the total number. Nodes
+    that are mirror images of other nodes are in no job and are not counted.
     """
     filled: dict[int, FilledNodes] = {}
     total = sum(len(job.samples) for job in jobs)
@@ -313,7 +311,7 @@ def solve_all(
     *,
     names: Sequence[str] = (),
 ) -> list[snapshots.Snapshot]:
-    """Load the snapshots of jobs from a store. Compute and store the missing snapshots.
+    """Load the solutions (snapshots) of jobs from a store; compute and store missing ones.
 
     on_progress: function that receives the number of finished snapshots. It may raise an exception
     to cancel the pending jobs. names: names of the stored snapshots. If `names` is empty, the names

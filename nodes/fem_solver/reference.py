@@ -1,7 +1,7 @@
-"""Compute reference solutions for the soft-body benchmark, and tables around a single point.
+"""Compute reference solutions for the soft-body benchmark, and nonlinear tables near one point.
 
-Reference solutions and tables consist of solutions of Newton's method for pushes at or near one
-surface point. Worker processes compute these solutions, and the cache stores them.
+Both consist of solutions of Newton's method for pushes at or near one surface point. Worker
+processes compute these solutions, and the cache stores them.
 """
 
 from __future__ import annotations
@@ -44,10 +44,9 @@ VERSION = 3
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSolution:
-    """A reference solution on one mesh for pushes at one sample point.
+    """A reference solution for pushes at one surface point, computed on one mesh.
 
-    name: description of the mesh. locator: search structure that finds points on the surface of the
-    mesh.
+    name: description of the mesh. locator: search structure for points on the mesh's surface.
     """
 
     name: str
@@ -75,10 +74,10 @@ class ReferenceSolution:
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the snapshot job for pushes on a mesh that is fine near the finger.
+    """Return the job (inputs) for pushes at a surface point on a mesh that is fine near it.
 
-    ratio: skin spacing near the finger, in finger radii. If the shape does not support meshes that
-    are fine only near the finger, all touchable skin has this spacing.
+    ratio: distance between skin nodes near the point, in finger radii. If the shape does not
+    support such meshes, all touchable skin has this spacing.
     """
     spacing = ratio * scene.finger.radius_m
     spec = replace(body.spec.mesh, skin_spacing_m=spacing)
@@ -96,9 +95,7 @@ def make_focused_job(
 def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the snapshot job for pushes on a mesh with the same node spacing on all touchable
-    skin.
-    """
+    """Return the job (inputs) for pushes at a surface point on a mesh with even skin spacing."""
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
     return snapshots.make_job_on_mesh(
         mesh,
@@ -112,7 +109,7 @@ def make_even_job(
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:
-    """Load the snapshots of jobs from the cache. Compute and cache the missing snapshots.
+    """Load the solutions (snapshots) of jobs from the cache; compute and cache missing ones.
 
     on_progress: function that receives the number of finished jobs and the total number. Raises
     OSError if a cache file cannot be read after it was written.
@@ -157,8 +154,8 @@ def _digest(*jobs: SnapshotJob) -> str:
 class LocalTable:
     """A nonlinear table of a body that is filled only near one surface point.
 
-    Near this point, its values equal the values of the full table. The table needs only a few
-    snapshots, whose jobs are in the attribute `jobs`.
+    Near this point, its values equal those of the full table. It is built from only a few snapshots
+    (precomputed pushes), whose inputs are in the attribute `jobs`.
     """
 
     def __init__(
@@ -192,7 +189,7 @@ class LocalTable:
         self.jobs += [] if fine_job is None else [fine_job]
 
     def body(self, solved: Sequence[Snapshot]) -> SceneBody:
-        """Return the body with a table that is built from snapshots.
+        """Return the soft body with this table, built from the solved snapshots.
 
         solved: snapshots of the jobs in `jobs`, in the same order.
         """

@@ -31,9 +31,7 @@ def shipped_path(entry: Specification[Table]) -> Path:
 
 
 def load_shipped(path: Path) -> dict[str, Snapshot]:
-    """Load the shipped snapshots from a file, and return them with their names as keys. If the file
-    does not exist, the result is empty.
-    """
+    """Load shipped snapshots by name from a file; the result is empty if the file is missing."""
     content = load_arrays(path)
     if content is None:
         return {}
@@ -53,9 +51,7 @@ def _decode(arrays: Mapping[str, NDArray[Any]]) -> Snapshot:
 
 
 def save_shipped(path: Path, snapshots: Mapping[str, Snapshot]) -> None:
-    """Write snapshots, given with their names as keys, to a compressed file. The displacements are
-    rounded.
-    """
+    """Write snapshots (by name) to a compressed file, with displacements rounded to 16 bits."""
     arrays: dict[str, NDArray[Any]] = {}
     for name, one in snapshots.items():
         scale_m = np.abs(one.moved).max(axis=(1, 2), initial=1e-9) / LEVELS

@@ -217,8 +217,7 @@ class SnapshotSet:
 def place_snapshots(
     samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
 ) -> list[PlacedSnapshot]:
-    """Return the snapshots and their mirror images. A snapshot on a plane of symmetry is not
-    duplicated.
+    """Return the snapshots and their mirror images, without duplicates in planes of symmetry.
 
     mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
     """

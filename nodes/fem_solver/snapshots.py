@@ -37,9 +37,8 @@ APART_RATIO, RIM_RATIO = 2.2, 0.9
 in finger radii. They apply to shapes other than cylinders."""
 TOLERANCE, MAX_STEP_RATIO, MIN_STEP_FRACTION = 1e-3, 1.0, 0.25
 """The settings of Newton's method for snapshots: the tolerance, and the maximum and minimum load
-step. The settings for a reference solution are stricter. The difference in force is at most 0.04 %,
-but the computation time is halved.
-"""
+step. The force differs by at most 0.04 % from that with the stricter settings of a reference
+solution, but the computation time is halved."""
 MIN_VOLUME_RATIO = 0.2
 """The minimum ratio of deformed to undeformed volume of any element. A push ends at this ratio.
 Below this ratio, the solution at the next depth would not converge."""
@@ -52,8 +51,7 @@ FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
 """The parameters of the fine mesh that corrects the forces. The first is the ratio of its skin
 spacing to the skin spacing of a snapshot. The second is the radius of the fine region, in finger
 radii. The third is the growth of the element size per distance (m/m). `FINE_DEPTHS_M` contains the
-push depths.
-"""
+push depths."""
 SAME_RATIO = 1e-6
 
 
@@ -237,8 +235,7 @@ def choose_sample_points(
 def order_by_spread(
     samples: list[SamplePoint], mirrors: list[Floats], towards_user: Floats
 ) -> list[SamplePoint]:
-    """Order sample points so that the first points of the result cover the skin as evenly as
-    possible.
+    """Order sample points so that the first points cover the skin as evenly as possible.
 
     The first point is nearest to the centre of the side that faces the user. Each next point is
     farthest from all previous points and their mirror images (farthest point sampling). mirrors:
@@ -305,10 +302,9 @@ def make_snapshot_job(
 def make_fine_job(
     spec: MeshSpec, sample: SamplePoint, *, poisson_ratio: float, finger_radius_m: float
 ) -> SnapshotJob | None:
-    """Return the job for a push on a fine mesh.
+    """Return the job for pushes on a fine mesh, whose forces correct those of the nonlinear table.
 
-    The solution of this job corrects the forces of a precomputed table. Return None unless the body
-    is a cylinder on a strip support.
+    Return None unless the body is a cylinder on a strip support.
     """
     spacing_m = FINE_RATIO * _spacing_m(spec, finger_radius_m)
     near_m = FINE_NEAR_RATIO * finger_radius_m
@@ -332,12 +328,11 @@ def _spacing_m(spec: MeshSpec, finger_radius_m: float) -> float:
 def _make_focused_mesh(
     spec: MeshSpec, sample: SamplePoint, spacing_m: float, near_m: float, growth: float | None
 ) -> SolidMesh | None:
-    """Return a mesh that is fine near a sample point, or None if the shape does not support such
-    meshes.
+    """Return a mesh that is fine near a sample point.
 
-    spacing_m: skin spacing near the point. near_m: distance from the point within which the mesh
-    has this spacing. growth: increase of the element size per distance (m/m); if it is None, the
-    default is used.
+    Return None unless the body is a cylinder on a strip support. spacing_m: skin spacing near the
+    point. near_m: distance from the point within which the mesh has this spacing. growth: increase
+    of the element size per distance (m/m); if it is None, the default is used.
     """
     geometry, support = spec.geometry, spec.support
     if not (isinstance(geometry, Cylinder) and isinstance(support, StripSupport)):
@@ -359,10 +354,7 @@ def _make_focused_mesh(
 
 
 def _mirror_axes(sample: SamplePoint) -> tuple[int, ...]:
-    """Return the axes of the planes of symmetry of a cylinder that contain the sample point.
-
-    Only the planes x = 0 and y = 0 are considered.
-    """
+    """Return the axes (0: x = 0, 1: y = 0) of a cylinder's planes of symmetry through a point."""
     return tuple(
         axis for axis in (0, 1) if max(abs(sample.point[axis]), abs(sample.normal[axis])) < SAME_M
     )

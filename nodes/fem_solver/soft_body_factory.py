@@ -108,9 +108,6 @@ class SoftBodyFactory:
     def _load_model(
         self, spec: precompute.SoftBodySpec, progress: precompute.Progress
     ) -> precompute.SoftBodyModel:
-        """Return the precomputed model for the inputs `spec`. If the last model has the same
-        inputs, it is reused. Otherwise, the model is loaded or computed.
-        """
         # Read `_model` only once: another thread whose result is no longer needed may replace it.
         last, key = self._model, spec.key()
         if last is None or last[0] != key:
@@ -120,9 +117,9 @@ class SoftBodyFactory:
     def pending_note(
         self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]
     ) -> str:
-        """Return a note for the user if the nonlinear table of the scene is missing.
+        """Return a note for the user if the scene's nonlinear table is missing, or an empty text.
 
-        The text is empty if the table is not missing. made: soft bodies of the scene.
+        made: soft bodies that `bodies` has built for the scene.
         """
         choice = scene.methods.soft_body
         waits_for_table = (
@@ -168,9 +165,7 @@ class SoftBodyFactory:
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Yield the executor that computes snapshots, and the number of its workers on this
-        computer.
-        """
+        """Yield the executor that computes snapshots, and its number of local workers."""
         if self.scheduler is not None:
             from flexsheet.nodes.fem_solver.dask_executor import (
                 connect_workers,  # imported late, because it is slow to import

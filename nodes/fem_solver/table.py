@@ -84,7 +84,7 @@ def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FillJob:
-    """A job for a worker process that interpolates snapshots at some contact nodes.
+    """The job (inputs) of a worker process that interpolates snapshots at some contact nodes.
 
     samples: contact nodes. rest (s, 3): undeformed positions of the s skin nodes, m. triangles (t,
     3): skin triangles. source: snapshots that are interpolated.
@@ -100,7 +100,7 @@ class FillJob:
 class FilledNodes:
     """The interpolated snapshots at n nodes and k depths.
 
-    moved (n, k, 3 s): displacements of s skin nodes, m. force_n (n, k, 3): forces, N. reached (n,):
+    moved (n, k, 3s): displacements of s skin nodes, m. force_n (n, k, 3): forces, N. reached (n,):
     mean number of depths at which the used snapshots converged. valid (n,): number of depths at
     which the displacement is valid.
     """
@@ -230,11 +230,10 @@ def compute_force_factors(
     """Return the factors (L,) that correct the forces of a table at the L depths (L,), m.
 
     The meshes of the table are too coarse for small contacts, so its forces are too large. Each
-    factor is an estimate of the true force divided by the force in the table at the same point. If
-    the table contains only the nonlinear response at a depth, the true force is estimated by
-    Richardson extrapolation of order 2 from the table's mesh and a fine mesh. At smaller depths,
-    the force on the fine mesh is the estimate. Beyond the maximum depth that was solved on the fine
-    mesh, the factor is constant.
+    factor is an estimate of the true force divided by the force in the table at the same point. At
+    depths of at least `BLEND_M[1]`, the estimate is the Richardson extrapolation of order 2 from
+    the table's mesh and a fine mesh. At smaller depths, it is the force on the fine mesh. Beyond
+    the maximum depth that was solved on the fine mesh, the factor is constant.
 
     fine: sample point of a push, and the snapshot (solution) of this push on the fine mesh.
     response, linear: response of the skin, and linear model of the soft body.
@@ -340,11 +339,10 @@ def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32
 
 
 def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
-    """Return the distance (m) between a point (3,) and the edges of a triangle, and the nearest
-    point.
+    """Return the distance (m) of a point (3,) from a triangle's edges, and the nearest edge point.
 
-    corners (3, 3): corners of the triangle. The nearest point on the edges is given in local
-    coordinates (2,) of the triangle.
+    corners (3, 3): corners of the triangle. The edge point is in the triangle's local coordinates
+    (2,).
     """
     starts, edge_vectors = corners, np.roll(corners, -1, axis=0) - corners
     along = np.clip(
@@ -483,7 +481,7 @@ class TableSoftBody:
     def _curve_at(self, nodes: Ints, weights: Floats) -> Floats:
         """Return the force curve (n, 2) of a skin point, interpolated between nodes.
 
-        Some of the weights are negative, so the sum of curves that do not fall can fall.
+        The running maximum is used, because negative weights could let the force fall with depth.
         """
         result = np.empty((len(self._depths), 2))
         result[:, 0] = self._depths

@@ -15,10 +15,7 @@ NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 class GaugeError(FlexsheetError, OSError):
-    """An error for a gauge that cannot be opened or read.
-
-    The error text names the device and the cause.
-    """
+    """Raised if a gauge cannot be opened or read. The text names the device and the cause."""
 
     code = "gauge"
     remedy = "Check the cable, the path in `port`, and the permission to open it (group dialout)."

@@ -13,9 +13,7 @@ from flexsheet.nodes.arrays import Floats
 
 
 def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Floats:
-    """Return the matrix (3, 3) of a pinhole camera with the given focal lengths and principal point
-    (px).
-    """
+    """Return the matrix (3, 3) of a pinhole camera from focal lengths and principal point, px."""
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
 
@@ -23,8 +21,7 @@ MAX_ITERATIONS = 20
 
 
 def distort(normalized: Floats, distortion: Floats) -> Floats:
-    """Apply lens distortion to normalized image coordinates (..., 2), and return the distorted
-    coordinates.
+    """Apply lens distortion to normalized image coordinates (..., 2).
 
     distortion: coefficients k1, k2, p1, p2, k3 (Brown 1966, in OpenCV's order).
     """
@@ -67,8 +64,7 @@ def undistort(distorted: Floats, distortion: Floats) -> Floats:
 
 
 def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Return the pixels (..., 2) onto which points (..., 3), m, in the camera frame are projected.
-    The points must have z > 0.
+    """Project points (..., 3), m, in the camera frame to pixels (..., 2). Requires z > 0.
 
     matrix: camera matrix (3, 3).
     distortion: coefficients, as for `distort`.

@@ -1,6 +1,4 @@
-"""Define the frame of a finger. The origin is at the finger pad, x points to the hand, and z points
-out of the nail.
-"""
+"""Define the frame of a finger: origin at the pad, x towards the hand, and z out of the nail."""
 
 from __future__ import annotations
 
@@ -17,8 +15,8 @@ def world_from_finger(
 ) -> Floats:
     """Return the rotation matrix (3, 3) from a finger's frame to the world frame.
 
-    direction_world: vector (3,) from the fingertip to the hand. If the finger is not tilted, its y
-        axis is horizontal.
+    direction_world: vector (3,) from the fingertip to the hand. If the finger is not tilted, its z
+        axis is perpendicular to the world's x axis.
     tilt_rad: rotation (2,) of the finger about the world's x and y axes, as a rotation vector.
     """
     x = np.asarray(direction_world, dtype=np.float64)

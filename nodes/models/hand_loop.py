@@ -90,8 +90,7 @@ class SampledLoop:
 
     period_s: time between two measurements.
     delay_s: time from a measurement until the sheet reaches the position computed from it.
-    bandwidth_rad_per_s: natural frequency of the filter of the depth; infinite if there is no
-        filter.
+    bandwidth_rad_per_s: natural frequency of the depth filter; infinite if there is no filter.
     lead_s: time by which the filtered depth is extrapolated with its estimated rate.
     """
 
@@ -121,8 +120,7 @@ def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[flo
 def make_loop_matrices(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the matrices (k, n, n) that map the n states over one period, for each of k slopes
-    (k,).
+    """Return the matrices (k, n, n) that map the n states over one period, for k slopes (k,).
 
     The states are the depth and its rate, the filter's estimates of both, and recent sheet offsets
     from newest to oldest. The offsets include the last two that the sheet has reached, and all that
@@ -190,11 +188,9 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the smallest magnitude of the slope at which the control loop is unstable. The result
-    is at most `max_slope`.
+    """Return the smallest magnitude, up to `max_slope`, of a slope with an unstable control loop.
 
-    towards_finger: whether the slopes are negative. If a slope is negative, the sheet moves towards
-        the finger.
+    towards_finger: whether the slopes are negative, so that the sheet moves towards the finger.
 
     The decay rate is interpolated between slopes on a grid. Slopes above the result are not
     evaluated, even if the loop is stable at some of them.
@@ -220,7 +216,7 @@ def compute_critical_slope(
 class OffsetBounds:
     """The maximum slopes (sheet offset divided by finger depth) at which every hand is stable.
 
-    bandwidths_rad_per_s (f,): bandwidths of the filter of the depth, ascending.
+    bandwidths_rad_per_s (f,): bandwidths of the depth filter, ascending.
     sheet_stiffnesses_n_per_m (k,): stiffnesses of the sheet under the finger.
     max_advances, max_retreats (f, k): maximum slopes towards the finger and away from it.
     """
@@ -231,20 +227,14 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) at which the control loop is stable if the sheet moves
-        towards the finger.
-
-        A slope is the sheet offset divided by the finger depth.
+        """Return the maximum stable slopes (n,) of an advance (motion towards the finger).
 
         stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) at which the control loop is stable if the sheet moves
-        away from the finger.
-
-        A slope is the sheet offset divided by the finger depth.
+        """Return the maximum stable slopes (n,) of a retreat (motion away from the finger).
 
         stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
@@ -287,13 +277,13 @@ class OffsetBoundsTable:
 
 
 def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
-    """Compute the maximum slopes at which the control loop is stable for all hands. It must be
-    stable even if its gain and delay are larger by the margins.
+    """Compute the maximum slopes at which the control loop is stable for all hands.
 
     advance_limit: upper limit of the slopes towards the finger.
 
-    For an advance, the critical slope is divided by the gain margin. For a retreat, the sheet's
-    stiffness is multiplied by the gain margin instead, because a retreat slope cannot exceed 1.
+    The loop must be stable even if its gain and delay are larger by the margins. For an advance,
+    the critical slope is divided by the gain margin. For a retreat, the sheet's stiffness is
+    multiplied by the gain margin instead, because a retreat slope cannot exceed 1.
     """
     shape = len(DELAYS_S), len(BANDWIDTHS_RAD_PER_S), len(SHEET_STIFFNESSES_N_PER_M)
     advances, retreats = np.empty(shape), np.empty(shape)

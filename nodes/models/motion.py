@@ -47,8 +47,7 @@ def follow(
     max_acceleration: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return the displacement (n,) of a point in one step towards a moving target, and its new
-    velocity (n,).
+    """Return displacement (n,) and velocity (n,) of a point after a step to a moving target.
 
     error (n,): target at the end of the step minus the current point.
     velocity, target_velocity (n,): current velocities of the point and of the target.
@@ -96,9 +95,7 @@ def desired_velocity(
 
 
 def measure_length(vector: Floats) -> float:
-    """Return the Euclidean norm of a small vector (n,). This function is faster than
-    `numpy.linalg.norm`.
-    """
+    """Return the Euclidean norm of a small vector (n,), faster than `numpy.linalg.norm`."""
     return sqrt(float(vector @ vector))
 
 
@@ -113,7 +110,6 @@ class SheetMotion:
 
     world_from_sheet: pose (4, 4), m.
     twist_world: linear and angular velocity (6,), m/s and rad/s.
-    stretch_ratio, stretch_rate_per_s: stretch ratio and its rate of change.
     """
 
     world_from_sheet: Floats
@@ -148,11 +144,7 @@ class EdgeBound:
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0 to 1) by which the linear and the angular speed of the sheet must be
-        multiplied.
-
-        At the reduced speeds, no point of the edges exceeds the limit.
-        """
+        """Return the factor (0 to 1) that reduces both speeds of the sheet to the edges' limit."""
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 
@@ -247,9 +239,7 @@ def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> Shee
 
 
 def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
-    """Return the motion after a time `duration_s` with constant velocity. A negative time is
-    permitted.
-    """
+    """Return the motion after a time `duration_s`, which may be negative, at constant velocity."""
     return replace(
         motion,
         world_from_sheet=moved(motion.world_from_sheet, motion.twist_world, duration_s),
@@ -281,9 +271,7 @@ def _decelerate(velocity: Floats, change: float) -> Floats:
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """Make the rotation matrix of a pose (4, 4) orthonormal again, and return the pose. The method
-    is Gram-Schmidt on the x and y axes.
-    """
+    """Return a pose (4, 4) with orthonormal axes, by Gram-Schmidt on the x and y axes."""
     (ax, bx, _, px), (ay, by, _, py), (az, bz, _, pz), last = pose.tolist()
     length = sqrt(ax * ax + ay * ay + az * az)
     ax, ay, az = ax / length, ay / length, az / length

@@ -32,8 +32,7 @@ class OneEuro:
         measured_velocity: Floats,
         step_s: float,
     ) -> tuple[Floats, Floats, float]:
-        """Return the new filtered value (n,), the new filtered velocity (n,) and the weight of
-        `value`.
+        """Return the filtered value (n,), the filtered velocity (n,) and the weight of `value`.
 
         filtered, velocity: results (n,) of the previous step.
         value, measured_velocity: new value (n,) and its unfiltered rate of change (n,).

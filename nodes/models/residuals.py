@@ -35,7 +35,7 @@ class ResidualMonitor:
     def __init__(
         self, components: int, *, threshold: float, memory_s: float = 1.5, confirm_s: float = 1.5
     ) -> None:
-        """Set the parameters of the monitor.
+        """Create a monitor that has no residuals yet.
 
         components: length of the residual vector.
         threshold: maximum magnitude of the mean, in the unit of the residuals.
@@ -49,9 +49,7 @@ class ResidualMonitor:
 
     @property
     def has_data(self) -> bool:
-        """Return whether the residuals cover enough time for a comparison of their mean with the
-        threshold.
-        """
+        """Return whether the residuals cover enough time to compare the mean with the threshold."""
         return self._weight_s >= 0.5 * self._memory_s
 
     @property
@@ -60,9 +58,7 @@ class ResidualMonitor:
         return float(np.linalg.norm(self.mean))
 
     def add(self, residual: Floats, at_ns: int) -> None:
-        """Add a residual vector that was measured at the time `at_ns`. A residual that is not
-        finite is ignored.
-        """
+        """Add a residual vector measured at the time `at_ns`; ignore it if it is not finite."""
         if not np.isfinite(residual).all():
             return
         step_s = 0.0 if self._last_ns is None else (at_ns - self._last_ns) * 1e-9

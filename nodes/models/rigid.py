@@ -178,8 +178,7 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """Return the pose (4, 4) of a body after it has moved for `duration_s` with a constant twist
-    (velocity).
+    """Return the pose (4, 4) of a body that has moved for `duration_s` with a constant twist.
 
     twist_world (6,): velocity of the body's origin (m/s), then angular velocity (rad/s).
     """

@@ -90,12 +90,13 @@ class LagBounds:
 class LagEstimate:
     """An estimated lag (s) of an arm with its standard deviation (s).
 
-    tracking_error_rad: standard deviation of measured minus commanded joint angles at this lag, as
-        the norm over the joints.
+    tracking_error_rad: standard deviation of measured joint angles minus commanded joint angles
+        delayed by the lag, as the norm over the joints.
     expected_error_rad: tracking error of a critically damped servo with this lag and motion.
     answer_delay_s: mean time from a command to the measurement.
-    command_interval_s: mean interval between commands. Both means are weighted by the square of the
-        speed, because faster motion determines the lag more.
+    command_interval_s: mean interval between commands.
+
+    Both means are weighted by the squared speed, as fast motion contains more information.
     """
 
     lag_s: float
@@ -115,10 +116,6 @@ class ServoLagEstimator:
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
-        """Create an estimator that has no data yet.
-
-        initial_s: initial lag, s; limited to the bounds.
-        """
         self.estimate: LagEstimate | None = None
         self.lag_s = bounds.clip(initial_s)
         self._bounds = bounds
@@ -221,9 +218,7 @@ class ServoLagEstimator:
             self._timing_s += weight / self._timing_weight * (timing_s - self._timing_s)
 
     def _solve(self) -> LagEstimate | None:
-        """Estimate the lag as the value with the smallest variance. Return None if the motion is
-        insufficient for an estimate.
-        """
+        """Return the lag of smallest error variance, or None if the motion is insufficient."""
         if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
             return None
         if not self._speed_square >= MIN_SPEED_RAD_PER_S**2:
@@ -259,14 +254,11 @@ class ServoLagEstimator:
 
 
 def _are_joints(joints_rad: Floats) -> bool:
-    """Return whether joint angles (6,), rad, are finite and not too large."""
     return bool((np.abs(joints_rad) <= MAX_JOINT_RAD).all())
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Add a value (6,) with the weight `gain` to a mean (6,) and a total variance, and return the
-    results.
-    """
+    """Return the mean (6,) and the total variance after a value (6,) of the weight `gain`."""
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square

@@ -76,15 +76,15 @@ value, the sheet feels 1.5 times as stiff as without an advance. The bounds that
 loop with the hand stable are usually lower."""
 
 SLOPE_TOLERANCE = 0.03
-"""The tolerance by which slopes may exceed their bounds. The bounds contain larger safety margins.
-"""
+"""The tolerance by which slopes of the offset may exceed their bounds. The bounds contain larger
+safety margins."""
 
 STRETCH_CANDIDATES = 17
 """The number of stretch ratios between the minimum and the maximum ratio that are tried."""
 
 
 class UnfitCurveError(FlexsheetError, ValueError):
-    """An error for a force curve that is not finite, not ascending, or too short."""
+    """The error raised if a force curve is not finite, not ascending, or too short."""
 
     code = "force-curve"
     phrase = "force curve:"
@@ -145,7 +145,7 @@ class StretchLimits:
     """The limits of the sheet's stretch, edge force and offset.
 
     edge_force_n: maximum force on each clamp.
-    bounds: bounds on the slope of the offset; None if the analysis does not include a hand.
+    bounds: bounds on the slope of the offset; None if no hand is considered.
     """
 
     min_stretch_ratio: float
@@ -154,7 +154,7 @@ class StretchLimits:
     bounds: OffsetBounds | None = None
 
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum advance (n,) of the sheet towards the finger per depth of the push.
+        """Return the maximum advances (n,) of the sheet towards the finger, divided by the depth.
 
         stiffnesses_n_per_m: n stiffnesses (n,) of the sheet.
         """
@@ -169,12 +169,12 @@ class StretchLimits:
 def make_stretch_limits(
     sheet: SheetSpec, model: SheetForceModel, bounds: OffsetBounds | None = None
 ) -> StretchLimits:
-    """Return the limits of the stretch that use the fraction USABLE_FRACTION of the scene's limits.
+    """Return the stretch limits: the fraction USABLE_FRACTION of the scene's limits.
 
     bounds: bounds on the slope of the offset that keep the control loop of sheet and hand stable.
 
-    The limit of the edge force applies while nothing touches the sheet. `render_force` limits the
-    additional edge force of a push.
+    The maximum stretch keeps the edge force within its limit while nothing touches the sheet.
+    `render_force` limits the additional edge force of a push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -197,9 +197,10 @@ def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RenderedForce:
-    """The forces that the sheet renders at n depths at one position with one stretch.
+    """The deflections and forces of the sheet at n depths, for one stretch and one position.
 
-    indentation_m: deflection of the sheet from its plane under the finger.
+    indentation_m: deflection of the sheet under the finger, which corresponds to an indentation of
+        the object.
     edge_force_n: force on each clamp.
     advance_per_depth: maximum advance of the sheet towards the finger, divided by the depth.
     force_limited: whether the limit of the edge force has reduced the indentation.
@@ -216,7 +217,7 @@ class RenderedForce:
 
     @property
     def normal_offset_m(self) -> Floats:
-        """Return the n distances (n,), m, of the sheet behind the object's tangent plane."""
+        """Return the sheet's offsets (n,), m, behind the object's tangent plane."""
         return self.depths_m - self.indentation_m
 
     @property
@@ -254,13 +255,13 @@ def render_force(
     *,
     max_depth_m: float,
 ) -> RenderedForce:
-    """Compute the best approximation of the object's force with one stretch at one position.
+    """Compute the sheet's indentations at which its force is closest to the object's force.
 
     push: stretch ratio, finger radius and position of the push.
     max_depth_m: maximum depth of the finger in the object.
 
-    The limit of the edge force limits the indentation. The indentation increases by at most 1 +
-    `limits.max_advance` times the increase of the depth.
+    The limit of the edge force limits the indentation. If the depth increases by d, the indentation
+    increases by at most (1 + `limits.max_advance`) * d.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
@@ -372,10 +373,10 @@ class Compliance:
     def normal_offset_m(
         self, depths_m: Floats | float, position_m: SheetPosition = CENTRE
     ) -> Floats:
-        """Return the sheet's distances (n,), m, behind the object's tangent plane.
+        """Return the sheet's offsets (n,), m, behind the object's tangent plane.
 
         depths_m: n depths (n,) of the finger in the object. If a depth is not positive, there is no
-            contact, and the distance is 0.
+            contact, and the offset is 0.
         position_m: (x, y) of the contact on the sheet.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
@@ -394,8 +395,8 @@ class Compliance:
         """Choose the bandwidth (rad/s) of the depth filter, and return whether the loop is stable.
 
         The result is the largest bandwidth at which the slopes of the offset are within their
-        bounds. If no bandwidth satisfies the bounds, the smallest bandwidth is chosen. If there are
-        no bounds, the bandwidth is infinite.
+        bounds. If there is none, the smallest bandwidth is chosen. Without bounds, the bandwidth is
+        infinite.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:

@@ -50,8 +50,8 @@ RIM_RADIUS_M = 0.03
 """The radius around the contact in which a finger deforms the sheet."""
 
 MIN_LIFT_M = 2e-4
-"""The minimum height (m) of the surface around a contact above the contact's tangent plane. If the
-surface is higher, the contact is reported as concave."""
+"""The height (m) above the contact's tangent plane beyond which the surface around a contact is
+reported as concave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class ContactCommand:
 
 
 class UnpresentableError(FlexsheetError, ValueError):
-    """An error for an object that the sheet cannot render."""
+    """The error raised if the sheet cannot render an object."""
 
     code = "unpresentable"
     remedy = "Make the object larger or smoother, or the sheet wider."
@@ -204,8 +204,7 @@ class ContactStateMachine:
 
         found: surface point nearest to the finger.
         moved: displacement (3,) m of the finger since the last step.
-        velocity: velocity (3,) m/s of the finger.
-        depth: depth (m) of the finger.
+        velocity, depth: velocity (3,) m/s and depth (m) of the finger.
 
         At small depths, the contact is the surface point nearest to the finger. Deep inside the
         object, the contact moves as far as the finger moves along the sheet. Both motions are

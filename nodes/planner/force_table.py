@@ -1,7 +1,8 @@
-"""Compute and cache the force table of a scene's sheet. The computation takes 1 to 2 minutes.
+"""Compute and cache the force table of a scene's sheet, which takes 1 to 2 minutes.
 
-The folder `tables` of the package contains the table for the sheet of the shipped scenes. It is
-named by the key of the cache, so an outdated table is not used. The command `python -m
+The table contains the sheet's force on the finger by stretch, depth and position. The folder
+`tables` of the package contains the table for the sheet of the shipped scenes. Its file is named by
+the key of the cache, so an outdated table is not used. The command `python -m
 benchmarks.ship_tables` writes it.
 """
 

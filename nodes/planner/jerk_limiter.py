@@ -144,8 +144,7 @@ def _desired_velocities(
 ) -> Floats:
     """Return the desired mean velocities (7,) of the next step within the edges' speed limit.
 
-    The first three elements are the linear velocity, the next three the angular velocity, and the
-    last element is the stretch rate.
+    The elements are the linear velocity (3), the angular velocity (3) and the stretch rate.
     """
     displacement = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(

@@ -23,9 +23,8 @@ MIN_STEP_RATIO = 1.0 / 512.0
 """The resolution of the search in `limit_tilt`, as a fraction of the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""The finer resolution of the search in `limit_tilt`, and the angle (rad) that defines its use. It
-is used while the tilt is below the maximum tilt by more than this angle. Deep inside the object, a
-small step can rotate the normal by many degrees."""
+"""The resolution of the search in `limit_tilt` while the tilt is below its maximum by more than
+NEAR_LIMIT_RAD. Deep inside the object, a small step can rotate the normal by many degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +58,7 @@ class SheetContact:
         return transform(self.axes, self.point - self.axes @ contact_sheet)
 
     def height_m(self, finger: Floats) -> float:
-        """Return the height (m) of a point (3,) m above the sheet's plane.
-
-        The height is negative for points below the plane.
-        """
+        """Return the height (m) of a point (3,) m above the sheet's plane; negative below it."""
         return float((finger - self.point) @ self.normal) - self.lift_m
 
 
@@ -139,7 +135,7 @@ def compute_tangent_twist(
     """Return the twist (6,) of a sheet that waits at a surface point while this point moves.
 
     rate: velocity (3,) m/s of the surface point.
-    home, half_width_m: see `make_tangent_contact`.
+    home, half_width_m: as in `make_tangent_contact`.
 
     With the surface normal n and the third axis h of `home`, the angular velocity of the sheet is n
     x dn/dt plus -(h x n) . dn/dt / (1 + h . n) about the normal.

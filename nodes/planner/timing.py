@@ -1,4 +1,4 @@
-"""Drop late fingertips, and adapt the prediction horizon to the measured delays."""
+"""Drop late fingertip messages, and adapt the prediction horizon to the measured delays."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ second, the time constant is 1.7 s."""
 
 
 class MonotonicTimestampFilter:
-    """A filter that drops each fingertip whose timestamp is before the last accepted timestamp.
+    """A filter that drops each fingertip message whose timestamp is before the last accepted one.
 
-    `RESTART_COUNT` consecutive late fingertips indicate that the clock was set back. The filter
-    then restarts.
+    `RESTART_COUNT` consecutive late messages indicate that the clock was set back. The filter then
+    restarts.
     """
 
     def __init__(self) -> None:
@@ -31,12 +31,10 @@ class MonotonicTimestampFilter:
         self._late_ns: list[int] = []
 
     def update(self, source_ns: int, first_step_s: float) -> float | None:
-        """Return the time (s) since the last accepted fingertip, or None if it is too late.
+        """Return the time (s) since the last accepted fingertip; None to drop the new fingertip.
 
-        source_ns: time of the exposure.
+        source_ns: time of the exposure of the new fingertip.
         first_step_s: result for the first fingertip and after a restart.
-
-        If the result is None, the new fingertip must be dropped.
         """
         last_ns = self._last_ns
         if last_ns is not None and source_ns < last_ns + MIN_STEP_NS:

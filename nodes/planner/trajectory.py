@@ -250,7 +250,7 @@ def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajecto
 
 
 def offset_along_normal(sheet: SheetMotion, offset_m: float, rate_m_per_s: float) -> SheetMotion:
-    """Move the sheet backwards along its normal by an offset, and correct its velocity.
+    """Move the sheet backwards along its normal by an offset, and change its velocity accordingly.
 
     rate_m_per_s: rate at which the offset changes.
     """

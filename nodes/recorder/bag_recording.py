@@ -30,7 +30,7 @@ class BagRecording:
     """A recorder that writes messages to bags while recording is requested.
 
     note: state of the recording, as one line of text.
-    lost: number of messages that were lost since the last bag.
+    lost: number of messages that were lost since the last bag ended.
 
     A bag is closed when the free disk space falls to `keep_free_bytes`. The remaining space is
     sufficient for the index of the bag. When twice as much space is free again, a new bag starts
@@ -63,7 +63,7 @@ class BagRecording:
         return None if self._bag is None else self._bag.path
 
     def start(self) -> None:
-        """Start a bag with the current time in its name. Raises BagError or OSError."""
+        """Start a bag named after the current time. Raises BagError or OSError if this fails."""
         self.requested, self.lost = True, 0
         # The time of day is only used to name the bag.
         now = datetime.now(UTC)
@@ -124,7 +124,6 @@ class BagRecording:
         )
 
     def _split(self, bag: BagWriter) -> None:
-        """Close the bag and start the next bag, which begins with the latched messages."""
         self._bag = None
         try:
             bag.close()
@@ -133,7 +132,7 @@ class BagRecording:
             self._end_bag(error)
 
     def write(self, topic: Topic, frames: Any, header: Header) -> bool:
-        """Write a message, and return True if the message is lost because no bag is open.
+        """Write a message's ZeroMQ frames; return True if they are lost because no bag is open.
 
         The last message of each writer of a latched topic is stored for the next bag. Recording
         commands are not stored.
@@ -201,8 +200,9 @@ def free_path(path: Path) -> Path:
 def open_bag(
     path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
 ) -> BagWriter:
-    """Open a bag at a free path, and attach files. Raises BagError or OSError.
+    """Create a bag, and attach files. Raises BagError or OSError if this fails.
 
+    path: path of the bag; a number is appended to its name if the path exists.
     recording: texts that identify the recording, by name.
     attach: files to store in the bag.
     """

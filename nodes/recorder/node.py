@@ -64,7 +64,7 @@ class Recorder(Node):
         self.note = self._recording.note
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Write a message's frames to the bag without decoding them."""
+        """Write the ZeroMQ frames of a message to the bag without decoding them."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         if self.parameters.start_paused and source.topic.message is Recording:

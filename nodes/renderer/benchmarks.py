@@ -40,8 +40,7 @@ pushed."""
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 LOWER_BOUND, TWO_PASS_TRIANGLES = "lower_bound", "two_pass_triangles"
 """The names of two benchmark methods. The first gives the lower bound of the time. The second is
-the method two_pass for a sheet that consists of four triangles.
-"""
+the method two_pass for a sheet that consists of four triangles."""
 CORRECTION_OF: dict[str, Correction] = {
     LOWER_BOUND: "none",
     **{correction: correction for correction in CORRECTIONS},
@@ -134,9 +133,7 @@ def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 
 def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """Return a copy of the scene whose projector has another resolution but illuminates the same
-    width.
-    """
+    """Return a copy of the scene with another projector resolution and the same lit width."""
     projector = require_projector(scene)
     lens, scale = projector.lens, width_px / projector.width_px
     cut = 0.5 * (projector.height_px * scale - height_px)
@@ -188,9 +185,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet pose for a case of the benchmark, and a function that returns the
-    error measure.
-    """
+    """Return the predicted sheet pose of a case, and a function that returns the error measure."""
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None

@@ -22,9 +22,7 @@ from flexsheet.nodes.models.shapes.triangles import intersect_rays
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 SIDE_M = 0.0053
-"""The side length of a projected mark. Its area equals the area of a round marker with a radius of
-3 mm.
-"""
+"""The side length of a projected mark, which has the area of a round marker of 3 mm radius."""
 
 FINGER_STEP_M = 0.001
 """The displacement of the fingertip for which the displacements of the marks are computed."""
@@ -56,7 +54,7 @@ NO_MARKS = CheckMarks(0, np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros(
 def place_marks(
     projector: Projector, world_from_sheet: Floats, mesh: SheetMesh, deeper: SheetMesh | None
 ) -> CheckMarks:
-    """Compute the check marks that a projector draws on the sheet to check the calibrations.
+    """Place the marks that the projector draws on the sheet to check the calibrations.
 
     world_from_sheet (4, 4): pose of the sheet. mesh: current mesh of the sheet. deeper: mesh of the
     sheet if the fingertip were `FINGER_STEP_M` deeper; None if there is no contact.

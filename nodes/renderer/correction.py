@@ -89,8 +89,7 @@ def make_pushed_screen(
 
 
 def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
-    """Return the unit normals (4, 3) of four planes, each through the eye, the pushed point and one
-    corner.
+    """Return unit normals (4, 3) of the planes through the eye, the pushed point and each corner.
 
     As seen from the eye, the lines from the pushed point to the corners divide the image into one
     sector for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
@@ -117,9 +116,7 @@ def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
 
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
-    """Return the points (n, 2) at which lines from the eye to points (n, 3) intersect the plane z =
-    0.
-    """
+    """Return the points (n, 2) where lines from the eye to points (n, 3) meet the plane z = 0."""
     fraction = eye[2] / (eye[2] - points[:, 2])
     crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * fraction[:, None]
     return crossings

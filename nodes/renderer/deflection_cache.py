@@ -32,8 +32,7 @@ VERSION = 2
 same inputs change."""
 
 STRETCH_SLACK = 0.01
-"""The margin by which the computed range of stretch ratios extends beyond each limit of the scene.
-"""
+"""The margin of the computed stretch ratios beyond each limit of the scene."""
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
 """The names of the fields of `IndentationBasis` that the cache file contains."""
@@ -51,9 +50,7 @@ Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return the rubber of a scene's sheet, and the range of pushes for which sheet shapes are
-    precomputed.
-    """
+    """Return the rubber (size, material) of a scene's sheet, and the range of required pushes."""
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(
@@ -65,7 +62,7 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Describe how the deflection shapes of a scene are stored in the cache.
+    """Return the cache key of a scene's deflection shapes, and their conversion to arrays and back.
 
     The shapes do not depend on the thickness and Young's modulus of the sheet.
     """
@@ -95,10 +92,9 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """List the scenes whose stored deflection shapes are interpolated for a given scene.
+    """List copies of a scene that have a stored finger radius and sheet width, with their weights.
 
-    The result consists of pairs (weight, scene). The listed scenes are copies of the given scene
-    that have a stored finger radius and a stored sheet width.
+    The weighted sum of their deflection shapes interpolates the shapes of the scene.
     """
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
@@ -115,7 +111,7 @@ def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
 
 
 def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> IndentationBasis:
-    """Return the deflection shapes of a scene as the weighted sum of stored shapes."""
+    """Return a scene's deflection shapes: the weighted sum of stored shapes, scaled in width."""
     rubber, _ = required_shapes(scene)
     stored = parts[0][1]
     wider = rubber.width_m / stored.rubber.width_m
@@ -133,8 +129,7 @@ def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> I
 
 
 def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
-    """Load the deflection shapes of a scene from the cache. Return None if some of the shapes are
-    missing.
+    """Load the deflection shapes of a scene from the cache, or return None if some are missing.
 
     cache_dir: folder of the cache; None selects the cache of the user.
     """

@@ -6,8 +6,7 @@ from collections import deque
 from statistics import median
 
 HISTORY = 31
-"""The number of recent frames from which latencies are computed. They cover half a second at 60 Hz.
-"""
+"""The number of recent frames from which latencies are computed, half a second at 60 Hz."""
 
 VSYNC_MARGIN_S = 0.0005
 """The minimum time (s) between the end of drawing and the buffer swap that shows the frame."""
@@ -19,15 +18,15 @@ ON_TIME_FRACTION = 0.85
 class DisplayLatencyEstimator:
     """An estimator of the display time of a frame.
 
-    The display time is the middle of the interval in which the frame is projected. All times are in
-    ns and are from the same clock. If there is a window, the display time is the time of the swap
-    (exchange of the window's buffers) plus a constant latency. If there is no window, the display
-    time is the end of drawing plus this latency. If swaps wait for the projector's refresh, the
-    prediction is based on the next swap for which the frame will be ready.
+    The display time (`light_ns`) is the middle of the interval in which the frame is projected. All
+    times are in ns and are from the same clock. If there is a window, the display time is the time
+    of the swap (exchange of the window's buffers) plus a constant latency. If there is no window,
+    the display time is the end of drawing plus this latency. If swaps wait for the projector's
+    refresh, the prediction is based on the next swap for which the frame will be ready.
     """
 
     def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:
-        """Create an estimator that contains no recorded frames.
+        """Create an estimator without recorded frames.
 
         first_s: time from the start of drawing to the display time, used for the first frame.
         display_latency_s: time from the swap, or the end of drawing, to the display time. period_s:
@@ -40,7 +39,7 @@ class DisplayLatencyEstimator:
         self._last_swap_ns = 0
 
     def predict_light_ns(self, begun_ns: int) -> int:
-        """Return the predicted display time of a frame whose drawing starts at `begun_ns`."""
+        """Return the predicted display time (ns) of a frame whose drawing starts at `begun_ns`."""
         if not self._shows_ns:
             return begun_ns + self._first_ns
         usual_ns = begun_ns + round(median(self._shows_ns)) + self._light_ns
@@ -53,8 +52,7 @@ class DisplayLatencyEstimator:
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
     def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
-        """Record a drawn frame if there is no window, and return the display time (ns) of the
-        frame.
+        """Record a frame that was drawn without a window, and return its display time (ns).
 
         begun_ns, drawn_ns: start and end of drawing.
         """
@@ -77,8 +75,7 @@ class DisplayLatencyEstimator:
         """Return whether a frame was displayed too late.
 
         A frame is too late if its display time exceeds the prediction by more than a tolerance. The
-        tolerance is half a refresh period or the display latency, whichever is larger.
-
-        light_ns, predicted_ns: measured and predicted display time.
+        tolerance is half a refresh period or the display latency, whichever is larger. light_ns,
+        predicted_ns: measured and predicted display time.
         """
         return light_ns - predicted_ns > max(self._period_ns // 2, self._light_ns)

@@ -31,8 +31,7 @@ MAX_SHIFT_M = 0.03
 
 
 class EyePredictor:
-    """A predictor of the eyes' positions. It computes the velocity as the slope of a line that is
-    fitted to recent positions.
+    """A predictor of the eyes' positions, which fits a line to the recent positions.
 
     max_age: maximum age of a message. If the last message is older, the predictor returns None.
     """
@@ -43,9 +42,7 @@ class EyePredictor:
         self._clock: tuple[str, int] | None = None
 
     def add(self, eye: Eye, header: Header) -> None:
-        """Add a message with eye positions. If the message is invalid, or follows a gap or a change
-        of clock, earlier positions are deleted.
-        """
+        """Add a message; delete earlier positions if it is invalid, late or of another clock."""
         clock, at_ns = (header.clock_id, header.epoch), header.source_ns
         known = self._positions
         if not eye.valid:
@@ -63,8 +60,8 @@ class EyePredictor:
     def predict(self, tracked: Input[Eye], horizon_s: float) -> Eye | None:
         """Return the eyes as predicted for a time `horizon_s` after the current time.
 
-        tracked: newest message with eye positions. Return None if there is no message, or if the
-        message is too old. An invalid message is returned unchanged.
+        tracked: input with the newest message. Return None if it has no message or one that is too
+        old. An invalid message is returned unchanged.
         """
         eye, age_s = tracked.message, tracked.age_s()
         if eye is None or age_s > self._max_age.seconds:
@@ -78,9 +75,7 @@ class EyePredictor:
         return eye.model_copy(update={"centre_world_m": eye.centre_world_m + shift})
 
     def _velocity(self) -> Floats:
-        """Return the velocity (3,), in m/s, of the eyes. The result is zero if the velocity is
-        unknown or implausible.
-        """
+        """Return the velocity (3,), in m/s, of the eyes; zero if it is unknown or implausible."""
         if len(self._positions) < MIN_MESSAGES:
             return np.zeros(3)
         newest_ns = self._positions[-1][0]

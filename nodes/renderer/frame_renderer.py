@@ -56,9 +56,7 @@ class RendererInputs:
 
 
 class FrameRenderer:
-    """A renderer that draws the frames of a scene. It also counts frames that were late, and frames
-    that were never shown.
-    """
+    """A renderer of the frames of a scene, which counts frames that were late or never shown."""
 
     def __init__(
         self,
@@ -167,9 +165,6 @@ class FrameRenderer:
         return frame, source_ns
 
     def _place_check_marks(self, sheet: SheetPose, now_ns: int) -> CheckMarks:
-        """Return the projected check marks if `CHECK_MARKS_PERIOD_NS` has elapsed; otherwise return
-        no marks.
-        """
         projector = self.scene_renderer.scene.projector
         if projector is None or not projector.check_marks_sheet_m:
             return NO_MARKS
@@ -216,9 +211,7 @@ class FrameRenderer:
 
 
 def is_touched(fingertip: Fingertip | None, soft_body: SoftBody | None) -> bool:
-    """Return whether the object can change its shape, because a finger is tracked or the object is
-    deformed.
-    """
+    """Return whether a finger is tracked (which may touch the object) or the object is deformed."""
     if fingertip is not None and fingertip.valid:
         return True
     return soft_body is not None and bool(soft_body.displacement_world_m.any())

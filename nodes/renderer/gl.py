@@ -101,9 +101,7 @@ class ImagePart:
 
     @contextmanager
     def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
-        """Restrict drawing to the area and the colour channels of this part, until the context
-        exits.
-        """
+        """Restrict drawing to this part's area and colour channels until the context exits."""
         whole = frame.viewport
         frame.viewport, frame.color_mask = self.viewport, (*self.channels, True)
         if self.is_grey:
@@ -134,9 +132,7 @@ class SurfaceMaterial:
 
 
 class Canvas:
-    """A drawing area: the OpenGL shaders, meshes and framebuffers for the image of one
-    projector.
-    """
+    """The OpenGL shaders, meshes and framebuffers for the image of one projector."""
 
     def __init__(
         self,
@@ -269,9 +265,7 @@ def _mark(point: Floats | None) -> tuple[float, ...]:
 
 
 class Uniforms:
-    """The uniforms (parameters) of a shader program. Only values that have changed are written to
-    OpenGL.
-    """
+    """The uniforms (parameters) of a shader program. Only changed values are written to OpenGL."""
 
     def __init__(self, program: moderngl.Program) -> None:
         self._program = program
@@ -336,9 +330,7 @@ def set_view(uniforms: Uniforms, view: EyeView) -> None:
 
 
 class _MeshBuffers:
-    """The OpenGL buffers of one mesh. Only the buffer of the current positions and normals is
-    written for each frame.
-    """
+    """The OpenGL buffers of one mesh: its constant rest shape, and its current shape."""
 
     def __init__(self, context: moderngl.Context, surface: ObjectSurface) -> None:
         self.count = len(surface.rest_world_m)
@@ -413,9 +405,7 @@ def is_software(context: moderngl.Context) -> bool:
 
 
 def headless_context() -> moderngl.Context:
-    """Return an OpenGL 3.3 context that has no window. Raises NoOpenGLError if the library EGL
-    cannot create such a context.
-    """
+    """Return an OpenGL 3.3 context without a window. Raises NoOpenGLError if EGL fails."""
     limit_driver_threads()
     # The type stub accepts further settings only as a dict.
     settings: dict[str, Any] = {"backend": "egl"}

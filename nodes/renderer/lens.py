@@ -28,7 +28,7 @@ class ClipLens:
 
 
 def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
-    """Convert a lens to OpenGL clip coordinates.
+    """Convert lens parameters to OpenGL clip coordinates.
 
     Return None if the lens has no distortion. Raises ValueError if the distortion is not invertible
     within the image.

@@ -22,9 +22,7 @@ class MaxAge:
     """
 
     def __init__(self, given_s: float | None = None) -> None:
-        """Set a fixed maximum age (s). If it is None, the maximum age is derived from the camera's
-        period.
-        """
+        """Set a fixed maximum age (s); None derives it from the measured period of the camera."""
         self.seconds = MIN_AGE_S if given_s is None else given_s
         self._is_given = given_s is not None
         self._last: Header | None = None

@@ -33,7 +33,7 @@ READ_TIME_NS = 2_000_000
 
 
 class Renderer(Node):
-    """Draw a frame for each soft-body message, at a rate of at most `rate_hz`.
+    """A node that draws a frame for each soft-body message, at a rate of at most `rate_hz`.
 
     If there are no recent soft-body messages, fingertip messages trigger frames. If there are no
     recent messages of either type, a timer triggers frames. If there is a window, the node
@@ -141,7 +141,7 @@ class Renderer(Node):
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
-        """Publish a frame that the window has shown. Any thread is allowed to call this method."""
+        """Publish the message about a shown frame. Any thread may call this method."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
     def _reopen(self) -> None:
@@ -181,9 +181,7 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish a frame that the window has shown, or that a newer frame has replaced before it
-        was shown.
-        """
+        """Publish the message about a frame; `swapped_ns` is 0 if a newer frame replaced it."""
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

@@ -152,8 +152,7 @@ def _cells(length_m: float, spacing_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Return points (n, 2) and triangles (t, 3) of a grid on a square. Both coordinates are from
-    -0.5 to 0.5.
+    """Return points (n, 2), from -0.5 to 0.5, and triangles (t, 3) of a grid on a square.
 
     columns, rows: number of cells. The triangles are counter-clockwise.
     """
@@ -217,8 +216,7 @@ class VertexNormals:
 
 
 class DeformationTransfer:
-    """An operator that transfers the displacement of the soft-body solver's skin to a drawn
-    surface.
+    """An operator that transfers the displacement of the solver's skin to a drawn surface.
 
     A drawn vertex moves with the nearest point of the skin. The normal of the vertex changes as
     much as the normal of the skin at this point. Values on the skin are interpolated between the
@@ -269,12 +267,12 @@ class DeformationTransfer:
 def transfer_matrix(
     points: Floats, skin_vertices: Floats, skin_triangles: Indices
 ) -> scipy.sparse.csr_array:
-    """Return the matrix (n, s), float32, that interpolates values of s skin vertices at n points
-    (n, 3).
+    """Return the matrix (n, s), float32, that interpolates values of s skin vertices at n points.
 
-    Each row contains the barycentric weights of the nearest point of the skin. skin_vertices (s,
-    3): vertices of the skin, m. skin_triangles (t, 3): vertex indices. A triangle is ignored if its
-    area is zero. Raises ValueError if all triangles have zero area, or if a vertex is not finite.
+    Each row contains the barycentric weights of the nearest point of the skin. points (n, 3), m.
+    skin_vertices (s, 3): vertices of the skin, m. skin_triangles (t, 3): vertex indices. A triangle
+    is ignored if its area is zero. Raises ValueError if all triangles have zero area, or if a
+    vertex is not finite.
     """
     if not np.isfinite(skin_vertices).all():
         raise ValueError("skin.vertices_world_m is not finite; check the soft-body solver")

@@ -1,6 +1,4 @@
-"""Select the eyes for which a frame is drawn, and the part of the projector's image for each
-eye.
-"""
+"""Select the eyes for which a frame is drawn, and each eye's part of the projector's image."""
 
 from __future__ import annotations
 
@@ -20,12 +18,11 @@ MIN_EYE_DISTANCE_M = 0.05
 
 
 def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
-    """Return the eye positions for drawing, the unit vector (3,) from the left to the right eye,
-    and a note for the user.
+    """Return the eyes for drawing, the unit vector (3,) from left to right eye, and a note.
 
     eyes: eye positions of the scene, which are used if no eyes are tracked. tracked: newest message
-    of the topic eye; None if there is no message, or if the message is too old. The note is the
-    reason why `tracked` is not used. It is empty if `tracked` is used.
+    of the topic eye; None if there is no message, or if the message is too old. The note for the
+    user is the reason why `tracked` is not used, or empty.
     """
     across = np.array([1.0, 0.0, 0.0])
     if tracked is None:

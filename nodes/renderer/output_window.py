@@ -1,6 +1,4 @@
-"""Provide the outputs of the renderer: an offscreen output, and a window on the projector's
-monitor.
-"""
+"""Provide the renderer's outputs: offscreen, or in a window on the projector's monitor."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ CLOSED = "the window was closed; restart the node to show frames again"
 class OutputWindow(Protocol):
     """The interface of an output that shows the images for the eyes.
 
-    context: OpenGL context for drawing, which is the current context of the calling thread.
+    context: OpenGL context for drawing, which is current in the thread that created the output.
     """
 
     context: moderngl.Context
@@ -130,8 +128,7 @@ class ProjectorWindow:
         self._filling: Slot | None = None
 
     def open(self, size: tuple[int, int]) -> None:
-        """Open the window for images of a given size (width, height), px, unless the window is
-        already open.
+        """Open the window for images of a size (width, height), px, unless it is already open.
 
         Raises WindowError if the monitor has no mode of this size.
         """

@@ -212,9 +212,7 @@ class _WindowQuad:
 
 
 def _function(name: str, result: Any, *arguments: Any) -> Any:
-    """Return a function of the OpenGL driver by its name, or None if the driver does not provide
-    the function.
-    """
+    """Return a function of the OpenGL driver by name, or None if the driver does not provide it."""
     address = glfw.get_proc_address(name)
     if not address:
         return None

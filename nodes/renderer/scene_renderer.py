@@ -59,10 +59,8 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 
 OVERSAMPLING, UNSAMPLED_OVERSAMPLING = 1.5, 2.5
 """The resolution of the eye's image (first pass of two_pass), divided by the resolution of the
-projector. The first value is used if multisampling is on, and the second value if it is off. On a
-software driver, drawing with the second value needs a quarter less time, and the edges are equally
-smooth.
-"""
+projector. The first value is used with multisampling, and the second value without it. On a
+software driver, the second value needs a quarter less time, and edges are equally smooth."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
 """The margin (m) around the object in the eye's image, and a step (m). The edges of the image are
@@ -71,9 +69,7 @@ MAX_WINDOW_M = 0.3
 """The maximum distance (m) of the edges of the drawn rectangle from the centre of the imaginary
 screen."""
 MIN_REPORTED_FRACTION = 0.005
-"""The minimum fraction of the sheet that is dark because of folds. If the fraction is smaller, no
-note reports it.
-"""
+"""The minimum unlit fraction of a folded sheet that a note reports."""
 NO_SHAPES_NOTE = (
     "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles; "
     "run flexsheet precompute"
@@ -109,11 +105,9 @@ class SceneRenderer:
 
         spacing_m: distance between the vertices of the object. samples: samples per pixel. If it is
         None, `SAMPLES` is used. With a software driver, the first pass of two_pass then uses no
-        multisampling.
-        basis: deflection shapes of the sheet; if it is None, a pushed sheet is drawn as four
-        triangles.
-        sheet_shape: method that computes the shape of the sheet. Raises ValueError if the
-        projector's lens maps several rays to one pixel.
+        multisampling. basis: deflection shapes of the sheet; if it is None, a pushed sheet is drawn
+        as four triangles. sheet_shape: method that computes the shape of the sheet. Raises
+        ValueError if the projector's lens maps several rays to one pixel.
         """
         projector, geometry = require_projector(scene), scene.object.geometry
         self.scene = scene
@@ -170,9 +164,7 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Set the surface mesh of the soft-body solver. The displacement of this mesh deforms the
-        drawn object.
-        """
+        """Set the solver's skin mesh, whose displacement deforms the drawn object."""
         vertices = skin.vertices_world_m.astype(np.float64)
         self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
@@ -229,9 +221,7 @@ class SceneRenderer:
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> SheetPose:
-        """Return an unstretched sheet on the plane z = 0, which is used until the poses of the arms
-        are known.
-        """
+        """Return an unstretched sheet on the plane z = 0, used until the arms' poses are known."""
         half = 0.5 * self.scene.sheet.width_m * np.array([1.0, 0.0, 0.0])
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
@@ -289,9 +279,7 @@ class SceneRenderer:
         )
 
     def place_check_marks(self, sheet: SheetPose) -> CheckMarks:
-        """Place the projected marks with which the calibrations are checked. The next images
-        contain these marks.
-        """
+        """Place the marks that check the calibrations; the next images contain these marks."""
         note, pushed_point, deeper = self.note, sheet.pushed_point, None
         if pushed_point is not None and self.sheet_shape == "reduced_order" and self.basis:
             deeper_point = pushed_point - FINGER_STEP_M * sheet.world_from_sheet[:3, 2]
@@ -303,7 +291,6 @@ class SceneRenderer:
         return self.check_marks
 
     def _draw_check_marks(self, part: ImagePart) -> None:
-        """Draw the projected check marks as white squares into a part of the image."""
         canvas, (left, bottom, width, height) = self.canvas, part.viewport
         scale = np.array([width / canvas.width_px, height / canvas.height_px])
         side_px = self.check_marks.side_px
@@ -324,11 +311,12 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image by the method two_pass with a given mesh of the sheet.
+        """Draw the projector's image by the method two_pass on a given mesh of the sheet.
 
-        The arguments and the result are the same as for `draw`.
+        Return an array (height, width, 3) if `read` is true, otherwise None. eyes (1 or 2, 3):
+        positions, world frame, m; None for the eyes of the scene. drawn: function that receives the
+        index of each finished image.
         """
-
         whole = self.canvas.width_px, self.canvas.height_px
 
         def draw_eye(eye: Floats, part: ImagePart) -> None:
@@ -390,7 +378,7 @@ class SceneRenderer:
         """Compute the mesh of the sheet by the method `sheet_shape`.
 
         If there are no deflection shapes, a mesh of four triangles replaces the method
-        reduced_order. In this case, the attribute `note` reports the limits of the four triangles.
+        reduced_order. The attribute `note` states why the mesh is inaccurate, or is empty.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
             lacks_shapes = self.sheet_shape == "reduced_order"
@@ -404,9 +392,7 @@ class SceneRenderer:
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a warning if the push is too deep for a sheet of four triangles; otherwise return
-        an empty text.
-        """
+        """Return a warning if the push is too deep for four triangles, otherwise an empty text."""
         if sheet.pushed_point is None:
             return ""
         depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])
@@ -418,9 +404,7 @@ class SceneRenderer:
         )
 
     def _report_folds(self, mesh: SheetMesh, eye: Floats) -> None:
-        """Compute the fraction of the sheet that is dark because of folds, and report it in the
-        attribute `note`.
-        """
+        """Compute the unlit fraction of a folded sheet, and report it in the attribute `note`."""
         self.occluded_fraction = occluded_fraction(mesh, eye, self._world_from_projector[:3, 3])
         if self.occluded_fraction > MIN_REPORTED_FRACTION:
             folds = (

@@ -46,9 +46,7 @@ class SheetPose:
 
     @property
     def contact_point(self) -> Floats:
-        """Return the pushed point (3,), m, or the centre of the sheet if no finger pushes the
-        sheet.
-        """
+        """Return the pushed point (3,), m, or the sheet's centre if no finger pushes the sheet."""
         return self.plane.point if self.pushed_point is None else self.pushed_point
 
 
@@ -61,8 +59,7 @@ def estimate_sheet(
     twist_world: Floats | None = None,
     ahead_s: float = 0.0,
 ) -> SheetPose | None:
-    """Predict the pose and the pushed point of the sheet from the measured poses (4, 4) of its
-    edges.
+    """Estimate the sheet's pose and pushed point from the measured poses (4, 4) of its edges.
 
     finger_tip (3,): predicted position of the fingertip, world frame, m; None if it is unknown. The
     fingertip pushes the sheet if it is below the plane and within the outline of the sheet.

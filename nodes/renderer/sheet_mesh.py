@@ -1,6 +1,4 @@
-"""Build a mesh of the sheet for the two-pass correction. The mesh is flat, deflected, or consists
-of four triangles.
-"""
+"""Build a flat, deflected or four-triangle mesh of the sheet for the two-pass correction."""
 
 from __future__ import annotations
 
@@ -26,8 +24,7 @@ the image is half a millimetre."""
 
 HALVINGS = 5
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
-"""The vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point (4).
-"""
+"""The vertex indices of the triangles between two corners (0 to 3) and the pushed point (4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +42,7 @@ class SheetMesh:
 
 
 def flat_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the mesh of an undeflected sheet. It consists of four triangles between the corners
-    and the centre.
-    """
+    """Return the mesh of an undeflected sheet: four triangles between its corners and centre."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
@@ -134,11 +129,11 @@ def deflected_mesh(
 
 
 def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
-    """Estimate the fraction, from 0 to 1, of the sheet's visible area that is dark due to folds.
+    """Estimate the fraction (0 to 1) of the sheet's visible area that folds keep unlit.
 
     A triangle gets no light if it faces away from the projector, or if the projector sees it
-    edge-on. The estimate contains the area of a dark triangle twice, because the triangle casts a
-    shadow of about the same area on the sheet. eye, projector (3,): positions, world frame, m.
+    edge-on. The area of an unlit triangle counts twice, because it casts a shadow of about the same
+    area on the sheet. eye, projector (3,): positions, world frame, m.
     """
     # One array for each coordinate is several times faster than an array of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)

@@ -36,8 +36,7 @@ class SheetPosePredictor:
         horizon_s: float,
         eye: Floats,
     ) -> SheetPose:
-        """Return the pose of the sheet that is predicted for the time `horizon_s` after the current
-        time.
+        """Return the sheet's pose predicted for the time `horizon_s` after the current time.
 
         Before the first valid pose, return the sheet at rest. finger_tip (3,): position of the
         fingertip at this time, world frame, m; None if it is unknown. eye (3,): midpoint of the
@@ -77,8 +76,7 @@ class SheetPosePredictor:
 def predict_fingertip(
     finger: Input[Fingertip], horizon_s: float, *, max_age_s: float
 ) -> Floats | None:
-    """Return the predicted position (3,), world frame, m, of the fingertip at the time `horizon_s`
-    after the current time.
+    """Return the predicted fingertip position (3,), world frame, m, `horizon_s` after now.
 
     Return None if the fingertip message is invalid or older than `max_age_s`.
     """

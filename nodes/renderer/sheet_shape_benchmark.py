@@ -46,8 +46,7 @@ sheet's centre, as fractions of the sheet's width and height."""
 
 
 def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return the benchmark of all sheet shape methods over stretch ratios, push depths and
-    positions.
+    """Return the benchmark of the sheet shape methods for several stretches, depths and positions.
 
     solved: whether to include the methods that need precomputed deflection shapes.
     """

@@ -18,9 +18,7 @@ MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
 shorter time amplifies noise, and a longer time causes lag."""
 
 MAX_PERIOD_S = 0.12
-"""The maximum time (s) between two successive responses. If the time is longer, they are not
-extrapolated.
-"""
+"""The maximum time (s) between two successive responses that are extrapolated."""
 
 MAX_EXTRAPOLATION_S = 0.06
 """The maximum time over which the displacement is extrapolated, in seconds."""
@@ -34,9 +32,7 @@ class SkinExtrapolator:
         self._clock_id = ""
 
     def add(self, body: SoftBody, header: Header) -> None:
-        """Add a response. If its skin mesh, method or clock differs from the earlier responses,
-        delete the earlier responses.
-        """
+        """Add a response; delete earlier ones of another mesh, method or clock, or later time."""
         last = self._history[-1][1] if self._history else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
         at_ns = header.source_ns + round(body.prediction_horizon_s * 1e9)
@@ -46,12 +42,11 @@ class SkinExtrapolator:
         self._history.append((at_ns, body))
 
     def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
-        """Return the response extrapolated to the time `at_ns` of a clock, and the time (ns) for
-        which it is valid.
+        """Return the response extrapolated to `at_ns`, and the time (ns) for which it is valid.
 
-        Return the newest response unchanged if it is from another clock, if it is later than
-        `at_ns`, or if no earlier response is suitable. Before the first response, return None and
-        0.
+        clock_id: clock of `at_ns`. The newest response is returned unchanged if it is from another
+        clock, if it is later than `at_ns`, or if no earlier response is suitable. Before the first
+        response, return None and 0.
         """
         if not self._history:
             return None, 0

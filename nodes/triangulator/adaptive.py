@@ -47,9 +47,9 @@ damping ratio of 0.5 sets a smaller bandwidth. Oscillators of low frequency mode
 around one point."""
 
 SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
-"""The prediction horizons (s) at which the prediction errors are measured to compute the weights.
-Horizons are rounded up to whole frames, and the first horizon is one frame. Weights for other
-horizons are interpolated."""
+"""The prediction horizons (s) at which prediction errors are measured to compute the weights of the
+filters. Horizons are rounded up to whole frames, and the first horizon is one frame. Weights for
+other horizons are interpolated."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
 """The maximum age of the earlier filter states that are stored to measure prediction errors."""
@@ -286,13 +286,13 @@ def _find_rows(horizons: bytes) -> Floats:
 
 @lru_cache(maxsize=512)
 def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
-    """Return factors (scored horizons + 1, n, 1) that interpolate predictions to n horizons.
+    """Return factors (m + 1, n, 1) that combine m weighted sums of predictions at n horizons.
 
     horizons: float64 array (n,) of horizons, s, as bytes, which the cache can hash.
-    ages_ms: age, ms, for which the weights of each scored horizon were computed.
+    ages_ms: horizons (m,), ms, for which the weights of the m sums were computed.
 
-    The last factor is the weight of the correction that the filtered position adds to the
-    predictions. It decreases from 1 at the horizon 0 to 0 at the first age.
+    The last factor multiplies the difference between the filtered position and the first sum at the
+    horizon 0. It decreases from 1 at the horizon 0 to 0 at the first of the m horizons.
     """
     times_ms = 1e3 * np.frombuffer(horizons)
     anchors_ms, counts = np.unique(ages_ms, return_counts=True)
@@ -324,18 +324,19 @@ def combine(covariance: Floats) -> Floats:
 class BankEstimate(Estimate):
     """The estimate of a filter bank at one time: the states (models, 5, 3), and their weights.
 
+    The prediction errors are measured at the h horizons in SCORED_HORIZONS_S.
+
     covariance: noise covariance (3, 3), m^2, of the newest measured point in the world frame.
     axes: axes of the states as columns (3, 3) in the world frame. The measurement noise is
         uncorrelated along these axes.
     points: number of points since the start of the track.
-    past_ns, past: times and states of earlier estimates, oldest first. They cover the longest
-        scored horizon.
-    error_covariance: covariance (scored horizons, 3, models, models), m, of the models' prediction
-        errors by axis, divided by the square root of the errors' magnitude.
-    weights: weights (scored horizons, 3, models), whose sum over the models is 1.
-    recent: recent mean square errors (scored horizons, 3, models + 1), m^2, of each model and of
-        the weighted sum.
-    scored_ages_ms: ages (ms) of the predictions that were compared with the newest point.
+    past_ns, past: times and states of earlier estimates, oldest first. They cover the h horizons.
+    error_covariance: covariance (h, 3, models, models), m, of the models' prediction errors along
+        each axis. Each error is divided by the square root of its magnitude.
+    weights: weights (h, 3, models), whose sum over the models is 1.
+    recent: recent mean square errors (h, 3, models + 1), m^2, of each model and of the weighted
+        sum.
+    scored_ages_ms: ages (h,), ms, of the predictions that were compared with the newest point.
     innovation: mean square error (3,), m^2, of the weighted prediction of the next point.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
     velocity_variance: error variance (3,), m^2/s^2, of the velocity along the axes.
@@ -494,10 +495,9 @@ def _prediction_errors(
     at_ns, point: time and position (3,) m of the new point, along the axes of the states.
     innovations: errors (models, 3), m, of the predictions from the newest state.
 
-    The first result contains the errors (scored horizons, 3, models), m. The errors for the first
-    horizon are the innovations. For every other horizon, the newest state that is at least as old
-    as the horizon is used, or the oldest state. The second result contains the ages (ms) of these
-    states.
+    Returns the errors (h, 3, models), m, for the h horizons in SCORED_HORIZONS_S, and the ages (ms)
+    of the states that predicted the point. The errors for the first horizon are the innovations.
+    Every other horizon uses the newest state that is at least as old, or the oldest state.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T

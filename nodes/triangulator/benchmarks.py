@@ -1,4 +1,4 @@
-"""Benchmark the methods that refine markers by their computing time and their error."""
+"""Measure the computing time and the error of the methods that refine markers."""
 
 from __future__ import annotations
 
@@ -177,9 +177,7 @@ def _marker_trial(
         return refine([image] * len(blobs), blobs, sensor)
 
     def error_px(_: list[Marker]) -> Interval:
-        """Return the root mean square error (px) per axis, or the image size if no marker was
-        found.
-        """
+        """Return the RMS error (px) per axis; a missing marker counts as an error of IMAGE_PX."""
         found = [markers_in(image) for image in images]
         off = [
             markers[0].centre - centre if len(markers) == 1 else np.full(2, float(IMAGE_PX))

@@ -1,8 +1,8 @@
 """Associate the markers of each image pair with the finger and with clutter.
 
 Clutter is every marker-like spot that is not the finger's marker. A marker outside the finger's
-gate (the region in which the finger is expected) counts as clutter. Clutter is tracked too, so
-clutter is not confused with a finger that was hidden or merged with clutter. Markers are assigned
+gate (the region in which the finger is expected) counts as clutter. Clutter is tracked too, so that
+it is not confused with a finger that was hidden or merged with clutter. Markers are assigned
 to tracks by position and brightness with the global nearest neighbour method (Bar-Shalom, Li,
 Kirubarajan, Estimation with Applications to Tracking and Navigation). If another assignment is
 about as likely, no fingertip is reported.
@@ -29,7 +29,7 @@ TrackStatus = Literal["tentative", "ambiguous", "clutter"]
 tentative: the marker is possibly the finger's marker, and can start the finger's track.
 ambiguous: it is uncertain whether the marker is the finger's marker, so it cannot start the
     finger's track yet.
-clutter: the marker is not the finger."""
+clutter: the marker is not the finger's marker."""
 
 POSITION_SIGMA_M = 0.0005
 """The scale (per axis) of a marker's deviation from motion at constant velocity, immediately after
@@ -159,7 +159,7 @@ class Track:
 
 @dataclass(slots=True)
 class ClutterTrack(Track):
-    """A track of a marker that is not known to be the finger.
+    """A track of a marker that is not known to be the finger's marker.
 
     stationary_point, stationary_since_ns: centre (3,) m of a ball with radius STATIONARY_RADIUS_M,
         and the time since which the marker has been in this ball.
@@ -350,7 +350,7 @@ class DataAssociation:
         return "no_marker" if is_all_clutter else "two_markers"
 
     def _select_candidate(self, at_ns: int) -> ClutterTrack | None:
-        """Return the track that is most likely the lost finger, or None if no track is certain."""
+        """Return the track that is most likely the lost finger, or None if this is uncertain."""
         finger = self._finger
         absence_s = math.inf if finger is None else (at_ns - finger.at_ns) * 1e-9
         candidates: list[tuple[float, ClutterTrack]] = []

@@ -37,5 +37,5 @@ class ExternalFingertip:
         return self._tracker.make_fingertip(at_ns, reason, measured_m, horizons_s=self._horizons_s)
 
     def predict(self, at_ns: int) -> Fingertip:
-        """Return an invalid fingertip for a time at which no position has arrived."""
+        """Predict the fingertip at a time without a measured position, and mark it as invalid."""
         return self._tracker.make_fingertip(at_ns, "no_marker", None, horizons_s=self._horizons_s)

@@ -44,8 +44,8 @@ SIZE_SIGMA = 0.2
 the blob divided by the expected radius."""
 
 HEIGHT_SIGMA = 0.25
-"""The standard deviation of the logarithm of a brightness ratio. The ratio is the brightness of a
-marker in the left view divided by its brightness in the right view."""
+"""The standard deviation of the logarithm of the ratio of a marker's heights in both views. The
+height is the difference between the grey levels of the marker and of its surroundings."""
 
 MISFIT_SIGMA_PX = 0.5
 """The standard deviation of a marker's reprojection error before its centres are refined."""
@@ -112,8 +112,8 @@ class BlobPair:
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
     gate_fraction: distance from the gate's centre divided by the gate's radius; 0 if there is no
         gate.
-    cost: sum of the squared deviations of rays, sizes, brightness and distance from the gate's
-        centre, in squared standard deviations.
+    cost: sum of the squared deviations of rays, radii, heights and distance from the gate's centre,
+        each divided by its variance.
     rejection_reason: reason why the pair cannot be a marker in the finger's working volume; None if
         it can be one.
     """
@@ -163,7 +163,7 @@ class StereoDetection:
     def correct_points(
         self, correct: Callable[[TriangulatedPoint], TriangulatedPoint]
     ) -> StereoDetection:
-        """Return a copy of this detection in which all triangulated points are corrected."""
+        """Return a copy of this detection with `correct` applied to all triangulated points."""
         measured = None if self.measured is None else correct(self.measured)
         markers, clutter = (
             tuple(replace(one, measured=correct(one.measured)) for one in candidates)
@@ -251,7 +251,7 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
 def _match_in(
     inputs: DetectionInput, windows: tuple[Window | None, Window | None]
 ) -> StereoDetection:
-    """Detect markers in one window of each image.
+    """Match the blobs of one window of each image, and select the finger's marker.
 
     windows: windows of the left and right image; None means the full image.
     """
@@ -285,9 +285,9 @@ def _match_in(
 def _match_blobs(
     inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
 ) -> list[BlobPair]:
-    """Return all pairs of blobs with rays that meet in front of the cameras.
+    """Return all pairs of blobs whose rays are closest to each other in front of both cameras.
 
-    A pair receives a rejection reason if its reprojection error is too large, if its radii are
+    A pair receives a rejection reason if its reprojection error is too large or its radii are
     wrong, or if it is outside the finger's working volume.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
@@ -330,11 +330,11 @@ def _match_blobs(
 
 @dataclass(frozen=True, slots=True)
 class RefinedPair:
-    """A pair of blobs with refined markers.
+    """A pair of blobs, and its left and right marker after the refinement to subpixel accuracy.
 
-    rejection_reason: reason why the pair cannot be the marker; None if the marker is valid.
-    cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
-        standard deviations.
+    rejection_reason: reason why the pair cannot be the finger's marker; None if it can.
+    cost: cost of the blob pair, plus the squared deviations of the refined radii, each divided by
+        its variance.
     """
 
     pair: BlobPair
@@ -445,10 +445,10 @@ def _flat_pose(
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the markers of refined pairs, sorted by cost.
+    """Return the valid markers of blob pairs after the refinement, sorted by cost.
 
-    A pair is dropped if its blobs probably show two different markers: both blobs belong to pairs
-    with lower costs, or one blob belongs to a pair with a much lower cost.
+    A pair is dropped if its blobs probably show two different markers. Then both blobs belong to
+    pairs with lower costs, or one blob belongs to a pair with a much lower cost.
     """
     unique: list[RefinedPair] = []
     for one in sorted(
@@ -490,7 +490,7 @@ def _refine_markers(
 def _rejection_reason(
     inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]
 ) -> FingertipReason | None:
-    """Return the reason why a refined pair cannot be the marker, or None if the marker is valid."""
+    """Return why a pair of blobs cannot be the marker after its refinement, or None if it can."""
     for marker in markers:
         if marker.rejection_reason is not None:
             return marker.rejection_reason
@@ -535,10 +535,7 @@ def _inside(volume: tuple[Floats, Floats], point_world: Floats) -> bool:
 def _triangulate(
     inputs: DetectionInput, markers: tuple[Marker, Marker]
 ) -> TriangulatedPoint | None:
-    """Triangulate a marker from its refined centres in both views.
-
-    Returns None if the rays through the centres do not meet.
-    """
+    """Triangulate a marker from its refined centres in both views, or return None if this fails."""
     noise_px, occlusion = inputs.config.noise_px, _occlusion_variance_px2(markers) * np.eye(2)
     left, right = (
         (marker.covariance if noise_px is None else noise_px**2 * np.eye(2)) + occlusion

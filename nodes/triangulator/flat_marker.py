@@ -82,8 +82,7 @@ def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
 
 
 def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
-    """Return the maximum difference (px) between the semi-axes of the measured and computed
-    ellipses.
+    """Return the maximum difference (px) between measured and computed semi-axes of the ellipse.
 
     normal: normal (3,) of the disc in this camera's axes.
     """

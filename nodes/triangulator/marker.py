@@ -188,19 +188,17 @@ def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = 
 
 
 def _count_pixels(outline: cv2.typing.MatLike) -> float:
-    """Return the number of pixels inside and on an outline between pixel centres.
-
-    The number follows from Pick's theorem.
-    """
+    """Return the number of pixels inside and on an outline of pixel centres (Pick's theorem)."""
     return cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
 
 
 def _detect_in_box(
     part: Image, box: Sequence[int], blob_filter: BlobFilter, origin: tuple[int, int]
 ) -> list[Blob]:
-    """Detect the blobs in a box (x, y, width, height) of an image part.
+    """Detect the blobs in a box (x, y, width, height), px, of a crop of the image.
 
-    origin: row and column at which the part begins in the image.
+    part, origin: the crop, and row and column of its first pixel in the image. Blobs are returned
+        in coordinates of the image.
     """
     rows, columns = _add_border(box)
     cut = part[rows, columns]
@@ -250,11 +248,11 @@ def _make_blob(
     peak: float,
     origin: tuple[int, int],
 ) -> Blob:
-    """Compute centre, radius, motion and spread of the blob in a window of an image part.
+    """Make the blob that a window of a crop of the image contains.
 
     cut: pixels of the window.
     area: number of pixels above half the blob's height (its grey levels above its surroundings).
-    origin: row and column at which the part begins in the image.
+    origin: row and column of the crop's first pixel in the image.
     """
     rows, columns = window
     skirt = np.float32(surround + SKIRT_FRACTION * (peak - surround))

@@ -66,7 +66,7 @@ class ProcessedPair:
     reason: "ok", or why no fingertip was measured.
     measured: marker of the finger, or None if it was not found.
     detection: markers that were found near the expected fingertip.
-    detect: function that detects all markers in the pair.
+    detect: function of a gate that detects the markers in the pair.
     """
 
     at_ns: int
@@ -177,8 +177,8 @@ class Triangulator(Node):
     def measure_fingertip(self, pair: StereoPair, header: Header) -> ProcessedPair | None:
         """Measure the fingertip in an image pair, and publish it.
 
-        Returns None if no scene has arrived. `search_surroundings` must be called with any other
-        result before the next pair is processed. Raises ValueError if the images are invalid.
+        Returns None if no scene has arrived. Otherwise, call `search_surroundings` with the result
+        before the next pair is processed. Raises ValueError if the images are invalid.
         """
         if self.geometry is None:
             return None

@@ -234,9 +234,7 @@ class OscInput(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Reopen the port if it is closed, and publish invalid messages for inputs that get no
-        data.
-        """
+        """Reopen a closed port, and publish invalid messages for inputs that receive no data."""
         if self.transport is None:
             await self._open()
         else:

@@ -98,11 +98,11 @@ class ProjectionCheck:
         return self._frames[-1][1] if self._frames else np.zeros((0, 3))
 
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
-        """Compare bright points (3,), m, of an image pair with the expected projected check marks.
+        """Compare bright points (3,), m, with the expected positions of the projected check marks.
 
         camera_shift_m: displacement (3,) by which an error of the camera's pose shifts the measured
             positions of the fixed reference marks.
-        at_ns: time of the image pair.
+        at_ns: time of the image pair that shows the points.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
         if not shown or len(points) < 2:
@@ -161,7 +161,7 @@ class ProjectionCheck:
         return np.asarray(np.where(on_sheet[:, None], (now - before) / step_s, np.nan))
 
     def _add_surface(self, heights_m: Floats, ratios: Floats, at_ns: int) -> None:
-        """Add the heights (n,), m, of the marks above the expected surface of the sheet.
+        """Add the heights (n,), m, of marks above the expected sheet to the residual monitors.
 
         ratios: displacements (n,) of the marks as fractions of the finger's displacement.
         """

@@ -139,8 +139,8 @@ class DiscFit:
     """The result of fitting a disc or an ellipse to an image.
 
     centre: centre (2,), px, with its covariance (2, 2), px^2.
-    radius, blur, motion: radius, blur and motion (x, y), px. The radius of an ellipse is the mean
-        semi-axis.
+    radius: radius of a disc, or mean semi-axis of an ellipse, px.
+    blur, motion: standard deviation of the edge blur, and motion (x, y) during the exposure, px.
     elongation: elongation (e, f), px, of an ellipse; see the module `ellipse`.
     height: difference of the grey levels of marker and ground.
     misfit: root mean square residual in excess of the noise, as a fraction of the height.
@@ -161,7 +161,8 @@ class DiscFit:
 
 
 RenderDiscs = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
-"""A function that renders images of discs and their derivatives, such as `_render_disc`."""
+"""A function of parameters (n, parameters) and of pixel coordinates x and y. It returns the grey
+levels of n discs or ellipses, and the derivatives with respect to the parameters."""
 
 
 def fit_discs(
@@ -286,12 +287,11 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
 
 
 def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]]:
-    """Return four numbers about the residuals of each fit.
+    """Return the weighted sum of squared residuals, and three related numbers, for each fit.
 
-    The numbers are the weighted sum of squared residuals, the number of pixels, the sum of weights,
-    and a variance ratio. The ratio is the variance of the odd part of the residuals divided by the
-    variance of the sensor noise. The odd part consists of differences between pixels mirrored about
-    the centre.
+    These are the number of pixels, the sum of weights, and a variance ratio. The ratio is the
+    variance of the odd part of the residuals divided by the variance of the sensor noise. The odd
+    part consists of differences between pixels mirrored about the centre.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -335,7 +335,7 @@ class DiscCutouts:
 def _cut_out_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> DiscCutouts:
-    """Cut out the pixels around each disc. The weights of pixels outside the image are zero."""
+    """Return a window around each disc. The weight of a pixel is 0 outside the image or margin."""
     lengths = [math.hypot(*one.motion) for one in starts]
     reaches = [
         one.radius + max(MARGIN_PX - MARGIN_PER_MOTION * length, MIN_MARGIN_PX)
@@ -493,7 +493,6 @@ def _make_fit(
 ) -> DiscFit:
     """Make the result of one fit, with a larger covariance if the residuals exceed the noise.
 
-    found: fitted parameters.
     corner: column and row of the cut-out's first pixel.
     fitness: one element of the result of `_fit_residuals`.
     """

@@ -259,9 +259,7 @@ class Tracker:
     def _extend_tentative_track(
         self, measurement: PositionMeasurement, unconfirmed_result: GateResult
     ) -> GateResult:
-        """Add a point to the tentative track.
-
-        If the tentative track is long enough, it replaces the track.
+        """Add a point to the tentative track, which replaces the track when it is long enough.
 
         unconfirmed_result: result while the tentative track is too short.
         """
@@ -273,7 +271,7 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Append a point to a sequence that the finger can follow, or start a new sequence."""
+        """Append a point to `previous`, or start a new sequence if both cannot be one track."""
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]

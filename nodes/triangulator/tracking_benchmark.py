@@ -62,9 +62,7 @@ class TruePathCase:
 class MeasuredPath:
     """The simulated measurements of a path at n times.
 
-    times_ns: times (n,).
-    points: measured points (n, 3), m.
-    covariances: covariances (n, 3, 3), m^2.
+    points, covariances: measured points (n, 3), m, and their covariances (n, 3, 3), m^2.
     truth: true points (n, 3), m, for each prediction horizon (s). Each of these points is the true
         position one horizon after a measurement.
     """

@@ -52,8 +52,8 @@ class StereoGeometry:
     ) -> StereoGeometry:
         """Make the geometry of the scene's stereo camera.
 
-        calibration: source of the lens parameters; None to use the values of the scene. The pose
-            always comes from the scene.
+        calibration: source of the intrinsics and of `right_from_left`; None to use the scene. The
+            left camera's pose always comes from the scene.
 
         Raises CalibrationMismatchError if the calibration belongs to another camera.
         """
@@ -74,7 +74,7 @@ class StereoGeometry:
         )
 
     def transform_to_cameras(self, points_world: Floats) -> tuple[Floats, Floats]:
-        """Return the coordinates of world points (..., 3), m, in the left and the right camera."""
+        """Transform world points (..., 3), m, to the frames of the left and the right camera."""
         in_left = rigid.apply(self.left_from_world, points_world)
         return in_left, rigid.apply(self.right_from_left, in_left)
 
@@ -118,7 +118,7 @@ def _matrix(lens: Lens) -> Floats:
 
 
 class ImageMismatchError(FlexsheetError, ValueError):
-    """An error for images that cannot come from the scene's camera."""
+    """Raised if images cannot come from the scene's camera."""
 
     code = "image-mismatch"
     remedy = "Change the camera in the scene to the camera that took the images."

@@ -173,7 +173,7 @@ class ArmMechanics:
 
 
 def _pose_error(wanted: Floats, present: Floats) -> Floats:
-    """Return the small motion (6,) from one pose to another: translation, m, and rotation, rad."""
+    """Return the small translation (m) and rotation (rad), (6,), from `present` to `wanted`."""
     turn = wanted[:3, :3] @ present[:3, :3].T
     spin = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -292,7 +292,7 @@ class Controller:
     noise_rad: standard deviation of the measured joint angles.
     cycle_s: period of the controller. A set-point takes effect when the next cycle begins. If the
         period is 0, set-points take effect immediately.
-    cycle_jitter_s: standard deviation of the start of a cycle.
+    cycle_jitter_s: standard deviation of the start time of a cycle.
     latency_s: time from the arrival of a set-point until it is ready for the next cycle.
     """
 
@@ -332,10 +332,7 @@ class Controller:
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Simulate the motion for `duration_s`.
-
-        The arm brakes if no command has arrived in time.
-        """
+        """Simulate the motion for `duration_s`, including the watchdog."""
         end_s = self._time_s + duration_s
         while self._pending and self._pending[0][0] <= end_s:
             due_s, wanted_rad = self._pending.popleft()

@@ -207,10 +207,7 @@ class TwinArmsNode(Node):
         return self._arms.left if side == "left" else self._arms.right
 
     def _true_joints(self, side: str, motor_rad: Floats) -> Floats:
-        """Return the true joint angles (6,), rad: the measured angles plus the true zero offsets.
-
-        motor_rad: measured joint angles (6,) after the backlash of the gears.
-        """
+        """Add the true zero offsets to the joint angles (6,), rad, at the outputs of the gears."""
         offsets_rad = self._truth(side).joint_offsets_rad
         return motor_rad + np.array(offsets_rad) if any(offsets_rad) else motor_rad
 

@@ -1,7 +1,7 @@
-"""Render images of a calibration board for the simulated stereo camera, and choose its poses.
+"""Choose poses of a calibration board, and render its images in the simulated stereo camera.
 
 The rays of each pixel are intersected with the plane of the board. Edges of squares are antialiased
-over the width of one ray. Therefore corners are accurate to a few thousandths of a pixel.
+over the distance between rays. Therefore corners are accurate to a few thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ BORDER_SQUARES = 0.6
 TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
 HEIGHT_FRACTIONS = (0.95, 0.5, 0.75, 0.35, 0.6)
 """The fractions of the image height that the board would fill in successive poses if it were not
-tilted. `TILTS_RAD` contains the tilts of the same poses.
-"""
+tilted. `TILTS_RAD` contains the tilts of the same poses."""
 
 MARGIN_PX = 6.0
 MIN_CHARUCO_FRACTION = 0.6
@@ -45,7 +44,7 @@ a ChArUco board must be visible."""
 
 
 class BoardError(FlexsheetError, ValueError):
-    """An error for a board that cannot be rendered."""
+    """Raised if a board cannot be rendered."""
 
     code = "board"
     exit_code = 2
@@ -101,7 +100,7 @@ class TwinBoard:
         return rays
 
     def corners(self, left_from_board: Floats) -> tuple[Floats, Floats]:
-        """Return the true pixels (rows * columns, 2) of the inner corners in both images.
+        """Return the true pixel positions (rows * columns, 2) of the inner corners in both images.
 
         The corners are ordered row by row. Raises BoardError unless all corners lie in front of
         both cameras.
@@ -113,7 +112,7 @@ class TwinBoard:
         return left, right
 
     def _views(self, left_from_board: Floats, points: Floats) -> list[Floats]:
-        """Project points (n, 3) of the board to pixels (n, 2) in each image.
+        """Return the pixel positions (n, 2) of board points (n, 3), m, in each image.
 
         Raises BoardError unless all points lie in front of both cameras.
         """
@@ -159,7 +158,7 @@ class TwinBoard:
         return Light(gain, slope_x, slope_y, np.clip(background, 5.0, 90.0).astype(np.float32))
 
     def _outline(self) -> Floats:
-        """Return points (n, 3), m, along the outer edge of the border, in the board's frame."""
+        """Return points (n, 3), m, on the outer edge of the white border, in the board's frame."""
         board = self.board
         low = -(1.0 + BORDER_SQUARES) * board.square_m
         high = np.array([board.columns, board.rows]) * board.square_m + BORDER_SQUARES * (
@@ -236,8 +235,8 @@ class TwinBoard:
         """Return `count` poses left_from_board (4, 4) that are suitable for a calibration.
 
         The board appears at the centre, corners and edges of the image, at several distances, with
-        tilts in all directions. It is as far from the image centre as possible while both images
-        show the whole board, or most of a ChArUco board.
+        tilts in all directions. At corners and edges, it is as far from the image centre as
+        possible while both images show the whole board, or most of a ChArUco board.
         """
         board = self.board
         board_centre = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
@@ -300,10 +299,9 @@ class TwinBoard:
 
 
 def _measure_rise(place: Singles) -> Singles:
-    """Return the change of a board coordinate from one ray to the next ray of a row or column.
+    """Return the change (rows, columns) of a board coordinate between neighbouring rays.
 
-    Each pixel has several rays. The change is computed for only one ray per pixel, because it
-    hardly varies within a pixel.
+    Only one ray per pixel is evaluated, because the change hardly varies within a pixel.
 
     place: board coordinate (rows, columns) of each ray.
     """

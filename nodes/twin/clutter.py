@@ -21,8 +21,8 @@ Views = Literal["both", "left", "right"]
 MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
-"""The world direction from the fingertip to the knuckle. In this direction, the finger does not
-hide its marker from the cameras."""
+"""The world direction from the fingertip to the knuckle. A finger with this direction does not hide
+its marker from the cameras."""
 
 
 class Trajectory(Protocol):
@@ -142,9 +142,9 @@ def second_marker(offset_m: Point) -> Clutter:
 
 
 def touching_highlight(overlap: float) -> Clutter:
-    """Return clutter that consists of a reflection beside the marker (+x).
+    """Return clutter that consists of a highlight on the +x side of the marker.
 
-    overlap: fraction of the marker's diameter that the reflection covers.
+    overlap: fraction of the marker's diameter that the highlight covers.
     """
     radius_m = 0.0015
     aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M

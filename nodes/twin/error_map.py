@@ -47,7 +47,7 @@ class ErrorMap:
 
     @property
     def sizes_m(self) -> Floats:
-        """Return the absolute errors (n,), m, of all n decoded points."""
+        """Return the magnitudes (n,), m, of the errors at all n decoded points."""
         sizes = np.linalg.norm(self.errors_m, axis=2)
         return np.asarray(sizes[np.isfinite(sizes)])
 

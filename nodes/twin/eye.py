@@ -3,7 +3,7 @@
 A virtual camera is placed at the eye. It views a square window about the origin of the screen plane
 (z = 0). Each ray is intersected with the triangles of the sheet, and gets the colour that the
 projector casts on this point. The expected image shows the virtual object itself and is rendered in
-the same way. Sizes are measured in both images as in Furukawa et al. 2007 ("the paper" below).
+the same way. Sizes are measured in both images as in Furukawa et al. 2007.
 
 "True" refers to the simulated devices. They may differ from the devices that the nodes assume. The
 module shares no code with the renderer, because it is used to test the renderer.
@@ -55,7 +55,7 @@ GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0,
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """An error for an image that does not show the whole object that must be measured."""
+    """Raised if an image does not show the whole object that must be measured."""
 
     code = "not-measurable"
     remedy = "Choose a pose in which the whole object is visible within the image."
@@ -76,7 +76,7 @@ class Rays:
     height: int
 
     def directions(self) -> Floats:
-        """Return the directions (height, width, 3) of all rays, which are not unit vectors."""
+        """Return the directions (height, width, 3) of all rays, without normalization."""
         columns, rows = np.arange(self.width), np.arange(self.height)
         return self.first + columns[None, :, None] * self.right + rows[:, None, None] * self.down
 
@@ -177,7 +177,7 @@ class TrueProjector:
         return first_hits(self._rays, self._vertices, self._triangles)
 
     def _straight(self, pixels: Floats) -> Floats:
-        """Remove the lens distortion from pixels (..., 2)."""
+        """Remove the effect of lens distortion from pixel positions (..., 2)."""
         lens = self._lens
         if not any(lens.distortion):
             return pixels
@@ -260,7 +260,7 @@ def seen(
     projected: projected image (height, width, 3).
     eye (3,): position, m.
 
-    A pixel is black if its rays miss the sheet, or if a fold of the sheet blocks the light.
+    A pixel is black if its rays miss the sheet, or if another part of the sheet blocks the light.
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
     projector = TrueProjector(require_projector(scene), vertices, triangles)
@@ -406,17 +406,11 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return the first and the last row (px) of the object at a column.
-
-        All three values can be fractions of pixels.
-        """
+        """Return the first and the last row (px, subpixel) of the object at a fractional column."""
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Return the first and the last column (px) of the object at a row.
-
-        All three values can be fractions of pixels.
-        """
+        """Return the first and the last column (px, subpixel) of the object at a fractional row."""
         return self._ends_between(self._gray, row)
 
     def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:

@@ -166,7 +166,6 @@ class TwinEyeNode(Node):
         return self._scenes[1]
 
     def _collect_situation(self, true_scene: Scene, arms: TwinArms) -> EyeSituation:
-        """Collect the true state from the latest messages."""
         finger, display = self.twin__finger.message, self.display.message
         skin, body = self.skin.message, self.soft_body.message
         # A deformation of another mesh is ignored.

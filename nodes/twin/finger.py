@@ -33,7 +33,7 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """An error for a path that the simulated finger cannot follow."""
+    """Raised if the simulated finger cannot follow a path."""
 
     code = "finger-path"
     remedy = "Slow the path down, or correct the point or line that the text names."
@@ -95,7 +95,7 @@ class Path(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """A motion along straight lines with corners that a moving average over +-ROUNDING_S rounds.
+    """A motion along straight lines whose corners are rounded by an average over +-ROUNDING_S.
 
     The average is computed exactly from the integral of the position. The rounded motion never
     leaves the convex hull of the points, never exceeds the speed on the lines, and has a continuous
@@ -126,10 +126,7 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,), m/s, on the lines between n points.
-
-        The rounded motion is not faster.
-        """
+        """Return the speeds (n - 1,), m/s, on the lines; the rounded motion is not faster."""
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
@@ -278,15 +275,15 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """The motion of the fingertip to a path and along it, with wander and tremor.
+    """The motion of the fingertip to a path and along it, with wander (slow noise) and tremor.
 
     start, start_velocity: position and velocity when the path message arrived, without wander and
         tremor.
     ease_s: duration of the motion to the first point.
     amplitudes_before_m, amplitudes_m: amplitudes of wander and tremor before the path message and
         on the path. During the motion to the first point, they are interpolated.
-    age_s: time at which wander and tremor are evaluated when the path message arrives. It includes
-        the duration of earlier motions, so wander and tremor do not jump.
+    age_s: time argument of `wander` and `tremor` when the path message arrives. It includes the
+        durations of earlier motions, so that wander and tremor are continuous.
     """
 
     path: Path

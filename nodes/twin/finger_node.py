@@ -244,8 +244,7 @@ class TwinFingerNode(Node):
         )
 
     def expose(self, middle_ns: int) -> StereoPair:
-        """Render the image pair with the timestamp `middle_ns`, and publish the true finger
-        position.
+        """Render the image pair with the timestamp `middle_ns`; publish the true finger position.
 
         The actual exposure time differs from `middle_ns` by the timestamp error in the parameter
         `apparatus` (true hardware parameters). A scene must have arrived before the call.
@@ -310,9 +309,9 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return the maximum delay (ns) of an exposure that does not cause a missed frame.
+        """Return the maximum delay (ns) of an exposure that does not cause a missed image pair.
 
-        An exposure may overlap the read-out of the previous frame.
+        An exposure may overlap the read-out of the previous image pair.
         """
         overlap_ns = self.exposure_ns + round(1e9 * self._read_out_s) - self.period_ns
         return self.exposure_ns + max(0, overlap_ns)
@@ -320,7 +319,7 @@ class TwinFingerNode(Node):
     async def _film(self) -> None:
         """Take images at fixed intervals until the node closes.
 
-        A frame whose exposure time has already passed counts as missed.
+        An image pair whose exposure time has already passed counts as missed.
         """
         await self.has_scene.wait()
         start_ns = self.clock.now_ns()
@@ -335,7 +334,7 @@ class TwinFingerNode(Node):
             await self.call("frame", self._take_frame, start_ns)
 
     async def _take_frame(self, start_ns: int) -> None:
-        """Simulate one frame from the start of its exposure to the end of its read-out."""
+        """Expose one image pair, and publish it at the end of its read-out."""
         middle_ns = start_ns + self.exposure_ns // 2
         pair = self.expose(middle_ns)
         read_out_ns = start_ns + self.exposure_ns + round(1e9 * self._read_out_s)

@@ -29,8 +29,8 @@ TIME_CONSTANTS_S = 10.0 ** np.arange(-1.0, 4.0)
 hours."""
 
 REVERSAL_RATIO = 0.1
-"""The relative change of the elastic force in which the hysteresis factor approaches its new value
-after a reversal. After this change, the remaining deviation is 1/e of the initial deviation."""
+"""The relative change of the elastic force, after a reversal, in which the deviation of the
+hysteresis factor from its new value decreases to 1/e."""
 
 MIN_FORCE_N = 1e-3
 """The elastic force (N) below which changes of the force do not affect the hysteresis."""
@@ -64,8 +64,7 @@ class ForceHistory:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self | None:
-        """Make the force history for the sheet of an apparatus (the true parameters of the
-        hardware).
+        """Make the force history from the true sheet parameters of an apparatus.
 
         Returns None if the sheet has neither hysteresis nor creep.
         """

@@ -24,8 +24,8 @@ from flexsheet.nodes.twin.sheet_pull import find_clamps, solve_sheet
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 CELLS = 12
-"""The number of finite elements along each side of the sheet. With 32 elements, the force differs
-by 1 %."""
+"""The number of intervals between nodes along each side of the sheet. With 32 intervals, the force
+differs by 1 %."""
 
 STATED_STANDARD_DEVIATION_N = 0.02
 """The standard uncertainty of the force (N) according to the gauge's data sheet. The node publishes

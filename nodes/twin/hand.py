@@ -99,8 +99,8 @@ class HandImpedance:
 class Touch:
     """The local state of the sheet below the finger at one time.
 
-    origin (3,): point of the unloaded sheet's tangent plane, m.
-    normal (3,): its unit normal towards the user.
+    origin (3,): point on the tangent plane of the unloaded sheet, m.
+    normal (3,): unit normal of this plane, towards the user.
     curve_n (d,): normal forces at the d depths in the force table `SheetReaction`.
     """
 
@@ -197,9 +197,7 @@ class CoupledFinger:
         return ahead
 
     def position(self) -> tuple[Floats, Floats]:
-        """Return position (m) and velocity (m/s), each (3,), of the fingertip at the simulation
-        time.
-        """
+        """Return the position (3,), m, and velocity (3,), m/s, of the fingertip at `time_s`."""
         position, velocity = self.path(self.time_s)
         return position + self.deviation_m, velocity + self.rate_m_per_s
 

@@ -1,6 +1,7 @@
 """Compute the points of the simulated sheet that the projected check marks illuminate.
 
-The simulated stereo camera sees these points. "True" refers to the simulated hardware.
+Check marks are white squares by which the calibrations are checked. The simulated stereo camera
+sees the illuminated points. "True" refers to the simulated hardware.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from flexsheet.nodes.twin.sheet_pull import find_clamps, solve_sheet
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
 CELLS = 8
-"""The number of finite elements along each side of the sheet. The solution takes 0.15 s."""
+"""The number of intervals between nodes along each side of the sheet. Solving takes 0.15 s."""
 
 SOLVE_PERIOD_NS = 500_000_000
 """The minimum time (ns) between two solutions of the sheet's shape."""
@@ -88,11 +89,9 @@ class LitMarks:
             self._frames.append((frame.light_ns + late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
-        """Return the illuminated points (n, 3), world frame, m, at the time `at_ns`.
+        """Return the illuminated points (n, 3), world frame, m; empty if the points are unknown.
 
-        The result is empty if the points are unknown.
-
-        finger (3,): position of the fingertip, m.
+        finger (3,): position of the fingertip at the time `at_ns`, m.
         """
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:

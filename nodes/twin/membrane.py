@@ -51,9 +51,8 @@ sheet."""
 MAX_ITERATIONS = 80
 
 UNDAMPED_ROUNDS = 6
-"""The number of equilibria in one finger step after which the changes of the friction forces are
-halved. Each time this number of further equilibria is solved, the changes are halved again. Without
-this damping, the changes could alternate."""
+"""The number of equilibria, in one step of the finger, between two halvings of the changes of the
+friction forces. Without this damping, the changes could alternate."""
 
 MAX_FRICTION_ROUNDS = 30
 """The maximum number of equilibria that are solved per finger step while nodes slip."""
@@ -65,7 +64,7 @@ GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """An error that is raised if the iteration for the membrane's equilibrium does not converge."""
+    """Raised if the iteration for the membrane's equilibrium does not converge."""
 
     code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
@@ -246,7 +245,10 @@ class _Mesh:
         return float(elastic - np.sum(self.load_n * positions))
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the gradient of `energy` (nodes * 3,) and the stiffness (elements, 27, 27)."""
+        """Return the gradient (nodes * 3,), N, of `energy`, and the stiffness of each element.
+
+        The stiffness has the shape (elements, 27, 27) and the unit N/m.
+        """
         f, c = self.deformation(positions)
         stress, tangent = relaxed_stress(c, self.shear_modulus, self.slack_tension)
         g, weight = self.gradient, self.weight
@@ -459,7 +461,8 @@ def solve(
     finger_tip: deepest point (3,), m, of the fingertip sphere. There is no contact if the point is
         None, in front of the sheet, or beside the sheet.
 
-    The other arguments and the exceptions are the same as for `solve_path`.
+    The other arguments are the same as for `solve_path`. Raises NotConvergedError if the iteration
+    does not converge, and ValueError if the edges coincide.
     """
     return solve_path(
         rubber,
@@ -492,8 +495,9 @@ def solve_path(
     finger_tips: positions (3,) on one normal of the sheet, sorted by depth.
     friction_coefficient: Coulomb coefficient between finger and sheet; None if touched nodes stick.
     cells: number of intervals between nodes along each side, an even number.
-    slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a sheet
-        with little tension, but the iteration for a slack sheet does not converge.
+    slack_tension: tension that is added everywhere, in units of the shear modulus. A smaller value
+        is more accurate for small pushes of a sheet with little tension, but the iteration for a
+        slack sheet does not converge.
 
     Raises NotConvergedError if an iteration does not converge, and ValueError if the edges
     coincide.
@@ -594,10 +598,9 @@ def _insert_midpoints(boundaries: Floats) -> Floats:
 
 
 def _cone(mesh: _Mesh, focus_m: tuple[float, float], rubber: TrueRubber) -> Floats:
-    """Return the fraction (nodes,) of a finger step by which each node moves initially.
+    """Return the fraction (nodes,) of a finger step by which each node moves in the initial guess.
 
-    The fraction is 1 at the pushed point `focus_m` and decreases linearly to 0 near the clamps. The
-    moved nodes are the initial guess of the next equilibrium.
+    The fraction is 1 at the pushed point `focus_m` and decreases linearly to 0 near the clamps.
     """
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus_m

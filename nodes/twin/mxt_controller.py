@@ -66,7 +66,7 @@ speed in one cycle."""
 
 
 class MxtError(FlexsheetError):
-    """An error for an invalid command, which ends the robot program of a simulated controller."""
+    """Raised if a command is invalid. The error ends the simulated controller's robot program."""
 
     code = "mxt-program"
     remedy = "No action is needed: the simulated controller's program restarts."
@@ -85,7 +85,7 @@ class MxtController:
     - a jump of the set-point
     - no packet for `timeout_s`
 
-    servo_lag_s, backlash_rad: see `Servo`.
+    servo_lag_s, backlash_rad: time lag of the joint servos, and backlash of the gears.
     noise_rad: standard deviation of the measured joint angles.
     filter_s: time constant of the low-pass filter on set-points.
     load_nm (6,): joint torques that the sheet's tension causes. The simulator sets them.
@@ -262,10 +262,7 @@ class MxtController:
         self._moved, self.wanted_rad = True, joints
 
     def _set_point(self, send_type: int, data: Floats) -> Floats:
-        """Decode the set-point (6,), rad, of a packet.
-
-        Raises MxtError if the set-point is invalid.
-        """
+        """Decode the set-point (6,), rad, of a packet. Raises MxtError if it is invalid."""
         if send_type != _JOINTS[0]:
             raise MxtError(f"the set-point has the unknown data type {send_type}")
         if not np.isfinite(data).all():

@@ -1,9 +1,9 @@
 """Map finger paths onto the scene's object, within the range of the arms, and read recorded paths.
 
-A surface position is (along, arc, height) in metres. `along` is the distance on the surface in the
-direction of the object's x axis. `arc` is the following distance on the surface at right angles to
-this direction. `height` is the distance from the surface, negative inside the object. The position
-(0, 0, 0) is the front of the object, which is the point that faces the user. Motions that are
+A surface position is (along, arc, height) in metres. The position (0, 0, 0) is the front of the
+object, which is the point that faces the user. From there, `along` is the distance on the surface
+in the direction of the object's x axis. Then `arc` is the distance at right angles to this
+direction. `height` is the distance from the surface, negative inside the object. Motions that are
 defined in surface positions apply to the object of any scene.
 """
 
@@ -138,9 +138,9 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines to the surface as functions of `along` and `arc`.
+        """Fit splines for the surface points as functions of the distances `along` and `arc`, m.
 
-        The splines cover 1.25 times the range of the finger's strokes.
+        In both coordinates, the splines cover 1.25 times the touchable length.
         """
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
@@ -348,8 +348,7 @@ def _soft_clip(values: Floats, half: float) -> Floats:
 def _read_recording(csv_path: Path) -> Floats:
     """Read the columns t_s, x_mm, y_mm, z_mm of a CSV file as an array (n, 4).
 
-    Raises FingerPathError if the file is invalid. The error names the file, the line and the
-    reason.
+    Raises FingerPathError if the file is invalid.
     """
     wanted = ["t_s", "x_mm", "y_mm", "z_mm"]
     try:

@@ -41,8 +41,7 @@ Window = tuple[slice, slice]
 """The rows and columns of a rectangular part of an image."""
 
 Position = Callable[[float], Floats]
-"""A function that returns the fingertip position (3,), m, at a time (s) relative to mid-
-exposure."""
+"""A function that returns the fingertip position (3,), m, at a time (s) since mid-exposure."""
 
 MOTION_STEP_PX = 0.7
 """The maximum distance (px) between the positions at which a moving object is drawn during one
@@ -304,8 +303,7 @@ class TwinCamera:
         yield right, instants_s, tips
 
     def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
-        """Return the times (n,), s, and fingertip positions (n, 3), m, at which the finger is
-        drawn.
+        """Return the times (n,), s, and tip positions (n, 3), m, at which the finger is drawn.
 
         The drawn positions add up to the motion blur. The times are relative to mid-exposure.
         Between successive times, the fingertip moves by at most MOTION_STEP_PX in the image.
@@ -481,8 +479,7 @@ class TwinCamera:
         return window
 
     def _flat_disc(self, eye: CameraView, places: Floats, normal: Floats) -> Window | None:
-        """Draw the marker as a flat disc that passes through world points (n, 3) during the
-        exposure.
+        """Draw a flat marker that passes through world points (n, 3) during the exposure.
 
         Returns the drawn window, or None if the disc is not visible or is seen from behind.
 
@@ -553,8 +550,7 @@ class TwinCamera:
         return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.marker_level), dtype=np.float32)
 
     def _grained(self, sheet: Sheet) -> Singles:
-        """Return the grey levels (rows, columns) of the sheet's texture, with two samples per
-        grain.
+        """Return the grey levels (rows, columns) of the sheet's texture, two samples per grain.
 
         The texture is the sum of fine and coarse noise. The left side is brighter.
         """
@@ -663,7 +659,7 @@ def _wipe(eye: CameraView, windows: list[Window]) -> None:
 
 
 def disjoint(windows: list[Window]) -> list[Window]:
-    """Return windows that do not overlap and cover the same pixels as the given windows.
+    """Return windows that do not overlap and cover all pixels of the given windows.
 
     Two overlapping windows are joined. If the joined window would be too large (see
     EMPTY_FRACTION), the overlap is removed from one of the two windows.

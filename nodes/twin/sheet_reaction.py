@@ -29,8 +29,8 @@ VERSION = 1
 """The version of the computation. Cached tables of other versions are computed again."""
 
 CELLS = 16
-"""The number of finite elements along each side of the sheet. With 32 elements, the force differs
-by 1 to 4 %."""
+"""The number of intervals between nodes along each side of the sheet. With 32 intervals, the force
+differs by 1 to 4 %."""
 
 DEPTH_FRACTIONS = np.array([0.04, 0.12, 0.25, 0.45, 0.7, 1.0])
 """The depths of the computed pushes, as fractions of the scene's maximum push depth."""
@@ -65,9 +65,7 @@ class SheetReaction:
     ratios: Floats
 
     def curve_n(self, distance_m: float, x_m: float, y_m: float) -> Floats:
-        """Return the forces (d,), N, at `depths_m`.
-
-        The forces are zero if the position is beside the sheet.
+        """Return the normal forces (d,), N, at the depths `depths_m`; zero beside the sheet.
 
         distance_m: distance between the edges.
         x_m, y_m: position relative to the sheet's centre.
@@ -88,9 +86,9 @@ class SheetReaction:
 def load_or_compute_reaction(
     scene: Scene, apparatus: Apparatus | None, cache_dir: Path | None = None
 ) -> SheetReaction:
-    """Return the force table of a scene's true sheet from the cache, or compute the table.
+    """Return the force table of a scene's true sheet from the cache, or compute it in 10 s.
 
-    The computation takes 10 s.
+    The weight of the sheet and the variation of its thickness are neglected.
     """
     true_scene = apply_apparatus(scene, apparatus)
     sheet = true_scene.sheet
@@ -121,12 +119,13 @@ def load_or_compute_reaction(
 def compute_reaction(
     rubber: TrueRubber, stretches: Floats, depths_m: Floats, *, finger_radius_m: float
 ) -> SheetReaction:
-    """Compute the force table with the membrane model. The sheet's weight is neglected.
+    """Compute a table of the sheet's force on the finger with the membrane model.
 
     stretches: stretch ratios (s,).
-    depths_m: push depths (n,).
+    depths_m: push depths (n,) in ascending order.
 
-    Raises NotConvergedError if the iteration does not converge for shallow pushes.
+    If the iteration does not converge, the force is extrapolated. Raises NotConvergedError if it
+    does not converge for one of the first two depths.
     """
 
     def push_n(stretch: float, across: float, along: float) -> Floats:

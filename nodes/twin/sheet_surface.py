@@ -21,9 +21,8 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 CELLS = 8
-"""The number of finite elements along each side of the sheet. In the usable part of the sheet, the
-sag differs by 0.3 % from the sag with 32 elements.
-"""
+"""The number of intervals between nodes along each side of the sheet's mesh. In the usable part of
+the sheet, the sag differs by 0.3 % from the sag with 32 intervals."""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
@@ -106,7 +105,7 @@ def _compute_tension(stretch: Floats) -> Floats:
 
 
 def lagrange(nodes: Floats, at: Floats | float) -> Floats:
-    """Return the Lagrange polynomials (n, ...) of `nodes` (n,) at positions `at` (...)."""
+    """Return the values (n, ...) of the Lagrange polynomials with `nodes` (n,) at points `at`."""
     factors = [
         np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0)
         for node in nodes

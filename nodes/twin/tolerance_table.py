@@ -56,7 +56,7 @@ class Distribution(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """A normal distribution, truncated at MAX_DEVIATION_SIGMAS and at `low` and `high`."""
+    """A normal distribution, clipped at MAX_DEVIATION_SIGMAS and at `low` and `high`."""
 
     mean: float
     sigma: float
@@ -72,7 +72,7 @@ class Normal:
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
-    """A log-normal distribution, truncated at MAX_DEVIATION_SIGMAS."""
+    """A log-normal distribution, clipped at MAX_DEVIATION_SIGMAS."""
 
     median: float
     sigma_ln: float
@@ -86,7 +86,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
-    """A distribution of absolute values of a normal variable, truncated at MAX_DEVIATION_SIGMAS."""
+    """The distribution of a normal variable's absolute value, clipped at MAX_DEVIATION_SIGMAS."""
 
     sigma: float
 
@@ -113,7 +113,7 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True)
 class LogUniform:
-    """A distribution from `low` to `high` whose logarithm is uniform."""
+    """A log-uniform distribution from `low` to `high`."""
 
     low: float
     high: float
@@ -157,8 +157,8 @@ class Tolerance:
     source, calibrated_source: literature or data sheet from which the numbers are taken.
     paper: distribution for the profile `paper`; None if it equals `modern`.
     calibrated: distribution after calibration; None if no calibration affects the parameter.
-    pair: distribution by which each arm deviates from a sample that both arms share; None if the
-        samples of both arms are independent.
+    pair: distribution of the difference between each arm's value and a value that both arms share;
+        None if the values of both arms are independent.
     frame_periods: profiles in which the distribution is given in periods of the true camera instead
         of seconds.
     """
@@ -415,7 +415,7 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random generator of a parameter, which is independent of other parameters."""
+    """Return a random generator for one parameter, independent of those of other parameters."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 

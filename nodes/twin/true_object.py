@@ -37,7 +37,7 @@ class TrueObject:
     vertices (v, 3): positions in the world frame, m. They are duplicated along sharp edges.
     triangles (t, 3): indices of vertices, counter-clockwise as seen from outside.
     normals (v, 3): unit normals.
-    sunk_m (v,): depths by which the vertices are pushed in.
+    sunk_m (v,): depths to which the vertices are pushed in.
     colour (3,): red, green and blue in full light, from 0 to 1.
     """
 

@@ -45,7 +45,7 @@ class SimulatorParameters(NodeParameters):
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return the delay (s) of a frame's true display after the time that the renderer assumes.
+    """Return the time (s) by which a frame is displayed later than the renderer assumes.
 
     The frame contains the latency that the renderer assumes. If no frame has been displayed, the
     nominal latency is used. The result is 0 if there is no apparatus (true hardware parameters).
@@ -234,7 +234,7 @@ def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
 
 
 def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:
-    """List the true hardware parameters (the apparatus) that are impossible in their scene.
+    """List the parameters of an apparatus that are impossible for the scene.
 
     An entry is (key, value, problem, remedy).
     """

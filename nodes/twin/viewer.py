@@ -60,7 +60,7 @@ class Viewer:
     def __init__(
         self, true_scene: Scene, sway: HeadSway | None, random: np.random.Generator
     ) -> None:
-        """Store the eyes of the scene and the motion of the head.
+        """Store the true eye positions and the motion of the head.
 
         sway: motion of the head; None if the head is at rest.
         random: generator of the alignment errors.

@@ -59,9 +59,7 @@ class Chart:
 
 
 def draw_charts(session: Session) -> dict[str, Chart]:
-    """Draw all charts for which the bag contains data, and return the charts with their names as
-    keys.
-    """
+    """Draw all charts for which the bag contains data, and return the charts by name."""
     makers: dict[str, Callable[[Session], Chart | None]] = {
         "timeline": timeline,
         "latency": latencies,
@@ -97,9 +95,7 @@ def _over_time(axes: Axes, session: Session) -> None:
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Add a marker to each value whose two neighbours are NaN, because a line does not show such a
-    value.
-    """
+    """Mark each value whose two neighbours are NaN, because a line does not show such a value."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         has_neighbour = np.zeros_like(known)

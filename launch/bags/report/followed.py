@@ -78,7 +78,7 @@ class FollowedFinger:
                 self.drop_outs += 1
 
     def figures(self) -> dict[str, Any]:
-        """Return a summary of the errors and drop-outs.
+        """Return a dictionary of figures (numbers) about the errors and drop-outs.
 
         contact_ratio: fraction of the exposures that are in contact.
         following_ratio: fraction of the exposures in contact at which the arms follow the finger.

@@ -17,7 +17,7 @@ from flexsheet.launch.bags.report.session import Session
 MARK = "<!-- made by: flexsheet bag report -->"
 """The comment by which a report is recognized.
 
-A file is not overwritten by a report if it does not contain this comment.
+A file that does not contain this comment is not overwritten by a report.
 """
 
 COLOURS = {

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from flexsheet.nodes.arrays import Floats
 
 MIN_DURATION_S, MAX_DURATION_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
-"""The minimum and maximum duration (s) in the histogram of `Spread`, and the number of bins per
-decade.
+"""The range of durations (s) in the histogram of `Spread`, and the number of bins per decade.
 
 Each bin is 2.3 % wide.
 """

@@ -76,8 +76,8 @@ MOVING = ("follow", "hold", "relax")
 MAX_END_S = 2.0
 """The maximum time (s) between the loss of an arm and the shutdown of its node at a session's end.
 
-An arm that is lost within this time and does not move again has not failed. Its loss is reported as
-the end of the session.
+An arm that is lost (disconnected) within this time and does not move again has not failed. Its loss
+is reported as the end of the session.
 """
 
 

@@ -95,7 +95,7 @@ class FingerRun:
         return self.zero_ns + round(begin_s * 1e9), min(finish_ns, self.end_ns)
 
     def figures(self) -> dict[str, Any]:
-        """Return a summary of how accurately the sheet followed the finger on this path."""
+        """Return figures (numbers) about how accurately the sheet followed the finger."""
         seconds = (self.done_ns - self.zero_ns) * 1e-9
         return {"path": self.label, "seconds": seconds, **self.followed.figures()}
 
@@ -294,10 +294,9 @@ class SheetErrors:
                 run.followed.add(d[inside], theta[inside], heights[inside], following[inside])
 
     def _read_contact(self, times_ns: Ints) -> tuple[Bools, Floats]:
-        """Return whether the sheet target was in contact, and its normal offset (m), at each given
-        time.
+        """Return contact flags (n,) and normal offsets (n,), in m, of the sheet target at n times.
 
-        times_ns: times (n,). Both results have the shape (n,).
+        Both are zero at times without data.
         """
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
@@ -308,10 +307,7 @@ class SheetErrors:
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:
-    """Return a summary of how accurately the sheet followed the finger, for each finger path.
-
-    The simulated finger paths are read from a bag.
-    """
+    """Return, for each path of the simulated finger in a bag, how accurately the sheet followed."""
     errors = SheetErrors(Grid(0, 1.0, 1))
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
         errors.add(message, header.source_ns)

@@ -56,7 +56,7 @@ def _draft_path(output: Path) -> Path:
 
 
 def _check(output: Path) -> None:
-    """Raise BagError if the page cannot be written.
+    """Raise BagError if the page cannot be written or would replace a file that is not a report.
 
     The check is made before the bag is read, because reading can take long.
     """

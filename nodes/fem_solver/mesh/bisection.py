@@ -24,8 +24,7 @@ _OFFSET = 1 << 20
 
 
 def make_lattice(half_cells: tuple[int, int, int]) -> tuple[Ints, Ints]:
-    """Return vertices (n, 3) and tetrahedra (e, 4) of a lattice of cubic cells centred on the
-    origin.
+    """Return vertices (n, 3) and tetrahedra (e, 4) of a lattice of cubic cells about the origin.
 
     half_cells: half the number of cells along each axis. The lattice is symmetric about its three
     central planes, and no tetrahedron has two boundary faces.
@@ -55,10 +54,9 @@ def bisect(
     Adjacent tetrahedra are also bisected, because neighbours must share whole faces.
 
     vertices (n, 3): integer coordinates. too_large: function that returns, for given vertices and
-    tetrahedra, whether each tetrahedron is too large.
-
-    Raises UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra are required, or edges shorter
-    than 1/64 of a cell of the initial lattice.
+    tetrahedra, whether each tetrahedron is too large. Raises UnfitMeshError if more than
+    `MAX_TETRAHEDRA` tetrahedra are required, or edges shorter than 1/64 of a cell of the initial
+    lattice.
     """
     while True:
         if len(tetrahedra) > MAX_TETRAHEDRA:

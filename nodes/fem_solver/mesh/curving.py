@@ -16,8 +16,7 @@ surface point is farther away, it is on the opposite side of a thin part."""
 
 
 def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Floats]) -> Floats:
-    """Move the midpoints of boundary edges to the nearest surface points, and return all nodes (n,
-    3).
+    """Move midpoints of boundary edges to the nearest surface points; return all nodes (n, 3), m.
 
     nodes (n, 3): nodes of a mesh with straight edges, m. elements (e, 10): node indices. nearest:
     function that returns the nearest surface points. The edges of an element remain straight if its

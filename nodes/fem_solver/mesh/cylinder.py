@@ -195,11 +195,10 @@ def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> F
 
 
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Return the angles (n,), in rad, of points on an arc from `start` to `stop`. The end is
-    excluded.
+    """Return the angles (n,), rad, of points on an arc from `start` to `stop` (excluded).
 
-    The distances between the points are the required element sizes. radius: radius of the arc, m.
-    depth: depth (m) of the arc below the curved side.
+    The points are about one required element size apart. radius: radius of the arc, m. depth: depth
+    (m) of the arc below the curved side of the cylinder.
     """
     fine = np.linspace(start, stop, 2001)
     return _sample_by_density(
@@ -236,7 +235,7 @@ def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
 
 
 def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
-    """Return the points (n, 2), as (y, z), and the triangles (t, 3) of the cross-section.
+    """Return the points (n, 2), as (y, z), m, and the triangles (t, 3) of a cross-section.
 
     The triangles are counter-clockwise as seen from +x. Two points are at the ends of the support.
     """
@@ -308,9 +307,8 @@ def _circle(radius: float | Floats, angles: Floats) -> Floats:
 def _triangles(points: Floats, where: Floats) -> Ints:
     """Triangulate points, and return counter-clockwise triangles (t, 3) of point indices.
 
-    points (n, 2): true positions. where (n, 2): positions from which the Delaunay triangulation
-    selects the connected points. These positions can differ from `points`. Triangles whose area is
-    zero are omitted.
+    points (n, 2): positions that determine the orientation of the triangles. where (n, 2): similar
+    positions from which the Delaunay triangulation is computed. Flat triangles are omitted.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
@@ -327,9 +325,8 @@ def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[
     """Extrude a cross-section, and return corner nodes (k, 3) and tetrahedra (e, 4).
 
     points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the s cross-sections, m.
-    The diagonals alternate between slices, so that the mesh has no preferred direction. swapped:
-    index of a slice that is divided as if its two ends were swapped. Every second slice before and
-    after it is divided in the same direction.
+    swapped: index of a slice that is divided as if its ends were swapped, as is every second slice
+    before and after it. Therefore the mesh has no preferred direction.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])

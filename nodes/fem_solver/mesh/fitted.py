@@ -38,8 +38,7 @@ from flexsheet.nodes.models.shapes import Shape
 INITIAL_CELL_RATIO = 2
 """The width of the lattice cells before they are bisected, divided by the minimum element size."""
 MIN_SIZE_RATIO = 0.5
-"""The minimum element size where the surface is sharply curved, divided by the minimum elsewhere.
-"""
+"""The minimum element size where the surface is sharply curved, relative to that elsewhere."""
 CURVATURE_SIZE_RATIO = 0.8
 """The maximum element size, divided by the radius of curvature of the surface."""
 SURFACE_DISTANCE_RATIO = 0.5
@@ -59,7 +58,7 @@ best fit is used."""
 
 
 class _SurfaceCache:
-    """A cache of the surface's distance, normal and curvature for each lattice vertex."""
+    """A cache of distance, normal and curvature of the surface for each lattice vertex."""
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m
@@ -89,7 +88,7 @@ class _SurfaceCache:
 
 
 def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3) and elements (e, 10) of the solid inside the surface of a shape.
+    """Return nodes (n, 3), m, and elements (e, 10) of a mesh of the solid inside a shape.
 
     low_m, high_m (3,): corners of the bounding box of the shape. grading: required element sizes.
     Raises UnfitMeshError if the shape is too thin for elements of these sizes.
@@ -190,12 +189,11 @@ def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
 
 
 def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
-    """Return the tetrahedra (k, 4) that have a core (interior) vertex, after the removal of
-    pinches.
+    """Remove pinches, and return the tetrahedra (k, 4) that have a core (interior) vertex.
 
-    Vertices where the boundary touches itself are removed from `core` (n,), in place. distance
-    (n,): signed distance (m) of the vertices from the surface. Raises UnfitMeshError if the object
-    is too thin.
+    A pinch is a vertex at which the boundary touches itself. Core vertices near it are removed from
+    `core` (n,), in place. distance (n,): signed distance (m) of the vertices from the surface.
+    Raises UnfitMeshError if the object is too thin.
     """
     before = int(core.sum())
     while True:
@@ -214,9 +212,9 @@ def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
 
 
 def _find_pinches(faces: Ints) -> Ints:
-    """Return the vertices (k,) at which a boundary of faces (f, 3) touches itself.
+    """Return the pinches (k,): vertices at which a boundary of faces (f, 3) touches itself.
 
-    At such a vertex, an edge belongs to more than two faces, or the faces form more than one fan.
+    At a pinch, an edge belongs to more than two faces, or the faces form more than one fan.
     """
     edges, uses = np.unique(
         np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1),

@@ -46,8 +46,7 @@ Vector = tuple[float, float, float]
 VERSION = 1
 """The version of the meshing code. Increase it when the mesh for the same specification changes."""
 TOUCH_MARGIN_RAD = 0.45
-"""The angle by which the touchable skin extends beyond the maximum sheet tilt of the working range.
-"""
+"""The angle by which touchable skin extends beyond the maximum sheet tilt of the working range."""
 SLAB_DEPTHS = 2.0
 """The depth of the slab that represents a half-space, divided by the scene's maximum push depth."""
 MIN_THICKNESS_SPACINGS = 4.0
@@ -57,12 +56,11 @@ MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
 """The measured maximum memory (bytes) that meshing needs per node."""
 SAMPLES = 16
-"""The number of samples along each side of the bounding box with which the number of nodes is
-estimated."""
+"""The number of samples along each side of the bounding box for the estimate of the node count."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""The measured ratio of the actual to the estimated number of nodes, for a cylinder and for a mesh
-file. `INNER_FACTOR` and `SKIN_FACTOR` apply to inner nodes and skin nodes before these factors."""
+"""Measured factors that correct the estimated number of nodes. `INNER_FACTOR` and `SKIN_FACTOR`
+correct inner and skin nodes. The other two then correct the sum for a cylinder and a mesh file."""
 MAX_LOST_FRACTION = 0.1
 """The maximum fraction of an object's volume that the mesh is allowed to omit."""
 
@@ -162,9 +160,7 @@ def _cylinder_rotation_rad(scene: Scene) -> float:
 
 
 def _rounded(vector: Floats) -> Vector:
-    """Round the components of a vector, so that small numerical differences do not change the
-    digest of a mesh.
-    """
+    """Round a vector, so that small numerical differences do not change the digest of a mesh."""
     # Adding zero converts -0.0 to 0.0.
     x, y, z = (float(value) + 0.0 for value in np.round(vector, 12))
     return x, y, z
@@ -229,8 +225,8 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
     """Build the mesh that a specification describes, in the mesh frame (`world_from_mesh`).
 
     Raises UnfitMeshError if the skin spacing does not fit the object or requires more than
-    `MAX_NODES` nodes, if the object is too thin for the elements, or if the support fixes too few
-    nodes or all touchable skin.
+    `MAX_NODES` nodes. It is also raised if the object is too thin for the elements, or if the
+    support fixes too few nodes or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))
@@ -264,8 +260,8 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
 def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
     """Build the mesh of a cylinder.
 
-    If the support is a strip, the mesh has nodes on the edges of the strip. Any other support fixes
-    the nodes inside its region.
+    If the support is a strip, the mesh has nodes on its edges, and the strip is fixed. Any other
+    support fixes the skin nodes inside its region.
     """
     strip = isinstance(spec.support, StripSupport)
     mesh = cylinder_mesh(
@@ -317,7 +313,7 @@ def _slab_normals(nodes: Floats) -> Floats:
 
 
 def _require_volume(mesh: Mesh, nodes: Floats, elements: Ints, spec: MeshSpec) -> None:
-    """Raise UnfitMeshError if the mesh omits parts of the object that are too thin for elements."""
+    """Raise UnfitMeshError if the mesh omits more than `MAX_LOST_FRACTION` of the object."""
     required_m3 = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
     lost_fraction = 1.0 - float(signed_volumes(nodes, elements).sum()) / required_m3
     if lost_fraction > MAX_LOST_FRACTION:

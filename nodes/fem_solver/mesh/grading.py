@@ -46,10 +46,9 @@ class Grading:
         return np.asarray(self._angles(normals) <= self.touch_angle_rad + 1e-9)
 
     def sizes(self, normals: Floats, depth_m: Floats) -> Floats:
-        """Return the required element sizes (n,), m.
+        """Return the required element sizes (n,), m, at n points of the object.
 
-        For each of the n elements, normals (n, 3) contains the unit normal of the nearest skin, and
-        depth_m (n,) contains the depth below this skin.
+        normals (n, 3): unit normal of the skin nearest to each point. depth_m (n,): depth below it.
         """
         behind = np.clip((self._angles(normals) - self.touch_angle_rad) / RAMP_RAD, 0.0, 1.0)
         coarser = 1.0 + (BACK_COARSENING - 1.0) * behind

@@ -40,9 +40,9 @@ class SolidMesh:
     nodes (n, 3): positions of the n nodes, m, mesh frame. elements (e, 10): node indices. fixed
     (n,): whether each node is fixed. skin (s,): indices of the nodes on the surface. skin_triangles
     (t, 3): indices into `skin`, ordered for outward normals. contact_nodes (m,): sorted indices of
-    the nodes on the skin that the finger can touch. contact_normals (m, 3): outward normals at
-    these nodes. contact_faces (f, 6): six-node triangles as indices into `contact_nodes`, ordered
-    for outward normals.
+    the skin nodes that the finger can touch. contact_normals (m, 3): outward normals at these
+    nodes. contact_faces (f, 6): six-node triangles as indices into `contact_nodes`, ordered for
+    outward normals.
     """
 
     nodes: Floats
@@ -80,7 +80,7 @@ def triangle_shape_functions_at(a: float, b: float) -> tuple[float, ...]:
 
 
 def boundary_faces(elements: Ints) -> Ints:
-    """Return the six-node faces (f, 6), with outward normals, that belong to a single element."""
+    """Return the six-node faces (f, 6) that belong to only one element, with outward normals."""
     faces = elements[:, FACES].reshape(-1, 6)
     _, first, counts = np.unique(
         np.sort(faces[:, :3], axis=1), axis=0, return_index=True, return_counts=True
@@ -90,11 +90,10 @@ def boundary_faces(elements: Ints) -> Ints:
 
 
 def nodes_in_planes(nodes: Floats, mirror_axes: tuple[int, ...]) -> Bools:
-    """Return whether each node is in each plane of symmetry, as an array (n, 3) with one column per
-    axis.
+    """Return flags (n, 3): whether each node is in the plane of symmetry normal to each axis.
 
-    nodes (n, 3): positions, m. mirror_axes: axes that are perpendicular to the planes, 0 for x = 0
-    and 1 for y = 0. The columns of other axes are false.
+    nodes (n, 3): positions, m. mirror_axes: axes with a plane of symmetry, 0 for x = 0 and 1 for
+    y = 0. The columns of other axes are false.
     """
     inside: Bools = np.abs(nodes) < SAME_M
     inside[:, [axis for axis in range(3) if axis not in mirror_axes]] = False
@@ -113,7 +112,7 @@ def skin_faces(nodes: Floats, elements: Ints, mirror_axes: tuple[int, ...]) -> I
 
 
 def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
-    """Convert tetrahedra (e, 4) to 10-node elements with straight edges.
+    """Add midside nodes to tetrahedra (e, 4), which become 10-node elements with straight edges.
 
     Return the nodes (n, 3), starting with the corners, and the elements (e, 10).
     """
@@ -134,8 +133,7 @@ def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
 
 
 def number_slabs(nodes: Floats, elements: Ints) -> Ints:
-    """Divide the mesh into slabs along its longest axis, and return the slab index (n,) of each
-    node.
+    """Divide the mesh into slabs along its longest axis; return the slab index (n,) of each node.
 
     The nodes of one element are in at most two successive slabs. Raises UnfitMeshError if the mesh
     consists of several separate components.
@@ -163,7 +161,7 @@ def make_solid_mesh(
 ) -> SolidMesh:
     """Sort the nodes by slab, find the skin and its touchable part, and return the mesh.
 
-    touchable, fixed (n,): whether each node can be touched, and whether each node is fixed. normals
+    touchable, fixed (n,): whether each node can be touched, and whether it is fixed. normals
     (n, 3): outward normals at touchable nodes. A face is touchable if all its nodes are touchable
     and none is fixed. Raises UnfitMeshError if no face is touchable, or if the mesh consists of
     several components.

@@ -101,9 +101,7 @@ def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
 
 
 def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
-    """Return how far (m) the lateral surface of a cylinder extends from the origin along a unit
-    vector.
-    """
+    """Return the extent (m) of the lateral surface without the end caps."""
     return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
 
 

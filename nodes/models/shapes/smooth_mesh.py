@@ -138,8 +138,8 @@ class SmoothMeshShape:
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
 
-        vertices_m (v, 3): vertices of the mesh, m. triangles (t, 3): vertex indices.
-        smoothing_m: smoothing length, m.
+        vertices_m (v, 3), triangles (t, 3): vertices of the mesh, and vertex indices.
+        smoothing_m: smoothing length.
 
         Raises MeshError if the mesh does not bound a solid, or is too small for the smoothing
         length. Raises ValueError if the smoothing length is not positive.
@@ -227,8 +227,7 @@ class SmoothMeshShape:
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """Find the surface point nearest to a query (3,), starting from the previous nearest point
-        `before` (3,).
+        """Find the surface point nearest to a query (3,), starting at the previous nearest point.
 
         Return None if the projection does not converge.
         """
@@ -247,8 +246,7 @@ class SmoothMeshShape:
         )
 
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
-        """Return the surface points nearest to queries (n, 3), and whether each point is ambiguous
-        (n,).
+        """Return the surface points nearest to queries (n, 3), and whether each is ambiguous (n,).
 
         before: nearest points (n, 3) of the previous queries, or None if there are none.
         """
@@ -263,8 +261,7 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _find_global_nearest(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """Return the surface points that are globally nearest to queries (n, 3), and whether each
-        point is ambiguous (n,).
+        """Return the points globally nearest to queries (n, 3), and whether each is ambiguous.
 
         A jet is a local quadratic fit of the surface. The projection of each query starts at the
         nearest jet, and gives a point at a distance D. Each point of the surface has a jet within
@@ -309,8 +306,7 @@ class SmoothMeshShape:
         """Choose further starting points for the search for a nearer surface point.
 
         lists: indices of the candidate jets (local quadratic fits) of each query.
-        feet (n, 3): nearest surface points that were found before, m. distance (n,): distances of
-            these points from the queries, m.
+        feet (n, 3), distance (n,): nearest points found before, and their distances, m.
 
         Return the starting points as k pairs of a query and a jet: query indices (k,) and jet
         indices (k,). A jet is chosen if the nearest point on its quadratic is close to the jet and
@@ -364,7 +360,7 @@ class SmoothMeshShape:
         return _on_surface_only(feet)
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return the height (m) of the object above its tangent plane at a surface point.
+        """Return the maximum height (m) of the object above its tangent plane at a surface point.
 
         This implements `Shape.rise_m`. The height is evaluated only at the centres of the jets.
         """
@@ -458,11 +454,10 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """Return the index of the jet (local quadratic fit) nearest to a point (3,), and nearby
-        jets.
+        """Return the index of the jet (local quadratic fit) nearest to a point (3,), and k jets.
 
-        The nearby jets are the k jets that have weight near the point. They are returned as indices
-        (k,), centres (k, 3), normals (k, 3) and shape operators (k, 3, 3).
+        The k jets have weight near the point. They are returned as indices (k,), centres
+        (k, 3), normals (k, 3) and shape operators (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -476,8 +471,7 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """A function object that evaluates the level set f of a mesh during the projection of one
-    query.
+    """The level set f of a mesh, as a function (`LevelAt`) for the projection of one query.
 
     To save time, the list of nearby jets is updated only when the point has moved by
     `MEMBERS_KNOWN` times `rho`.
@@ -574,8 +568,7 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
 
 
 def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
-    """Select vertices that are at least `spacing` (m) apart on each side of a thin part, and return
-    their indices.
+    """Select vertices at least `spacing` (m) apart on each side of thin parts; return indices.
 
     Every vertex that is not selected has a selected vertex within `spacing` on the same side.
     """

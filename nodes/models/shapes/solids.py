@@ -44,8 +44,7 @@ class CylinderShape(Convex):
         check_positive(radius_m=self.radius_m, length_m=self.length_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the points of the lateral surface nearest to `points` (n, 3) or (3,), as
-        `Shape.closest` specifies.
+        """Find the points of the lateral surface nearest to `points`, as `Shape.closest` specifies.
 
         The nearest point is ambiguous for points on the axis.
         """
@@ -101,9 +100,7 @@ class SphereShape(Convex):
 
 @dataclass(frozen=True, slots=True)
 class PlaneShape(Convex):
-    """The half-space z <= 0, whose face can be touched on a rectangle that is centred on the
-    origin.
-    """
+    """The half-space z <= 0, which can be touched on a rectangle centred on the origin."""
 
     width_m: float
     height_m: float
@@ -112,8 +109,7 @@ class PlaneShape(Convex):
         check_positive(width_m=self.width_m, height_m=self.height_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the points of the rectangle nearest to `points` (n, 3) or (3,), as `Shape.closest`
-        specifies.
+        """Find the points of the rectangle nearest to `points`, as `Shape.closest` specifies.
 
         `on_edge` is true beyond the rectangle, whose width is along x and whose height is along y.
         """
@@ -188,9 +184,7 @@ class EllipsoidShape(Convex):
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate a quadratic function that is zero on the ellipsoid. This implements a
-        `LevelSet`.
-        """
+        """Evaluate a quadratic function that is zero on the ellipsoid (a `LevelSet`)."""
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
@@ -200,9 +194,7 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate the function of `_level` at a single point with Python numbers. This implements
-        a `LevelAt`.
-        """
+        """Evaluate the function of `_level` at one point with Python numbers (a `LevelAt`)."""
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
@@ -319,23 +311,20 @@ class RoundedBoxShape(Convex):
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,), m, of the core. The core is the box between the centres of
-        curvature of the rounded edges.
-        """
+        """Return the half extents (3,), m, of the core."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Return the face of the core that is nearest to each query (n, 3) inside the core. The
-        core is the box between the centres of curvature of the rounded edges.
+        """Return the face of the core that is nearest to each query (n, 3) inside the core.
 
         before: previous nearest points (n, 3), or None if there are none. Only faces that contain
             these points are considered. If there are none and several faces are equally near, the
             first face in the order z, y, x, -z, -y, -x is chosen.
 
-        Return the axis (n,) and the sign (n,) of the face's normal, the distance from the face
-        (n,), m, and whether the choice is ambiguous (n,).
+        Return four arrays (n,): axis and sign of the face's normal, distance from the face, m, and
+        whether the choice is ambiguous.
         """
         core = self._core()
         # Columns z, y, x, -z, -y, -x.

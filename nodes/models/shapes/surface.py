@@ -86,17 +86,17 @@ class Shape(Protocol):
         ...
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distances (m) of points to the solid, which are negative inside.
+        """Return the signed distances (m) from points to the solid, which are negative inside.
 
-        Raises ValueError if `closest` does not accept the points.
+        Raises ValueError if a coordinate is not finite or exceeds `MAX_QUERY_M`, or if the shape of
+        the array is neither (3,) nor (n, 3).
         """
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return the maximum height (m) of the object above its tangent plane at a surface point
-        (3,).
+        """Return the maximum height (m) of the object above its tangent plane at a surface point.
 
-        normal (3,): unit normal at the point.
+        point, normal (3,): surface point, m, and unit normal at this point.
         radius_m: maximum considered distance from the point, measured along the plane.
 
         The result is 0 if the object is not concave near the point. Heights near the limit of the

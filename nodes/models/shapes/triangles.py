@@ -86,8 +86,7 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
 
 
 def triangulate_grid(rows: int, columns: int) -> Indices32:
-    """Return triangles (t, 3) that connect the points of a grid. The points are numbered row by
-    row.
+    """Return triangles (t, 3) that connect grid points, which are numbered row by row.
 
     The triangles are counter-clockwise if the column number increases along +x and the row number
     along +y.
@@ -116,9 +115,7 @@ def half_edges(triangles: Indices) -> Indices:
 
 
 def _check_edges(triangles: Indices) -> None:
-    """Raise MeshError unless every edge belongs to two triangles that contain the edge in opposite
-    directions.
-    """
+    """Raise MeshError unless each edge has two triangles that contain it in opposite directions."""
     run = half_edges(triangles)
     edges, uses = np.unique(np.sort(run, axis=1), axis=0, return_counts=True)
     open_edges, crowded = int((uses == 1).sum()), int((uses > 2).sum())
@@ -363,8 +360,7 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return whether each of n line segments passes through the interior of its triangle, as an
-    array (n,).
+    """Return whether (n,) each line segment passes through the interior of its triangle.
 
     start, end (n, 3): end points of the segments.
     corners (n, 3, 3): one triangle for each segment.
@@ -418,11 +414,9 @@ def intersect_rays(
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Return the points of n triangles that are nearest to `points` (n, 3).
+    """Return barycentric coordinates (n, 3) of the points of triangles nearest to `points` (n, 3).
 
     corners (n, 3, 3): corners of one triangle for each point.
-
-    The results (n, 3) are barycentric coordinates.
 
     Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
     """

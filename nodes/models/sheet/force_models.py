@@ -78,9 +78,7 @@ class SheetForceModel(Protocol):
         ...
 
     def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
-        """Return the reason why the model is inaccurate for a push, or "" if the model is valid for
-        the push.
-        """
+        """Return why the model is inaccurate for a push, or "" if the model is valid for it."""
         ...
 
 
@@ -103,9 +101,7 @@ def _check_depths(depths_m: Floats) -> Floats:
 def relative_position(
     rubber: Rubber, stretch_ratio: float, position_m: SheetPosition
 ) -> tuple[float, float]:
-    """Return the coordinates (|x|, |y|) of a position (m), scaled to be 0 at the centre and 1 at
-    the edge.
-    """
+    """Return (|x|, |y|) of a position (m), scaled to be 0 at the centre and 1 at the edge."""
     half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
     return abs(position_m[0]) / half_width, abs(position_m[1]) / (0.5 * rubber.height_m)
 

@@ -5,9 +5,9 @@ depths. A proper orthogonal decomposition reduces the shapes to a dozen modes. P
 Chebyshev points interpolate the modes' coefficients. The computation of a shape then takes about
 0.1 ms.
 
-The grid on the sheet moves with the finger and is densest at the finger. Therefore the tip of the
-indentation is always at the same grid nodes. Solutions are computed for positions in one quadrant.
-Solutions for the other quadrants follow by symmetry.
+The grid on the sheet moves with the finger and is densest at the finger. Therefore the same grid
+nodes are always at the deepest point of the sheet. Solutions are computed for positions in one
+quadrant. Solutions for the other quadrants follow by symmetry.
 """
 
 from __future__ import annotations
@@ -80,11 +80,11 @@ class IndentationBasis:
     def offsets(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> Floats:
-        """Return the displacements (rows, columns, 3), m, of grid points from the flat stretched
-        sheet.
+        """Return displacements (rows, columns, 3), m, of grid points from the flat stretched sheet.
 
-        position_m: (x, y) of the fingertip in the sheet frame. Rows are along y and columns along
-            x. Inputs outside the precomputed range are clamped to this range.
+        position_m: (x, y) of the fingertip in the sheet frame.
+
+        Rows are along y, columns along x. Inputs are clamped to the precomputed range.
         """
         mirrored = (position_m[0] < 0.0, position_m[1] < 0.0)
         weights = (
@@ -104,7 +104,7 @@ class IndentationBasis:
         return np.asarray(shape)
 
     def grid(self, stretch_ratio: float, position_m: tuple[float, float]) -> Floats:
-        """Return the points (rows, columns, 2), m, of the flat sheet to which `offsets` refers.
+        """Return the grid points (rows, columns, 2), m, on the flat sheet that `offsets` displaces.
 
         position_m: (x, y) of the fingertip in the sheet frame.
         """
@@ -117,8 +117,7 @@ class IndentationBasis:
     def invalid_reason(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> str:
-        """Return the reason why a push is outside the precomputed range, or "" if the push is
-        inside.
+        """Return why a push is outside the precomputed range, or "" if it is inside.
 
         position_m: (x, y) of the fingertip in the sheet frame.
         """
@@ -140,7 +139,8 @@ class IndentationBasis:
 class IndentationCase:
     """The inputs of one finite-element solution of a push.
 
-    The inputs include a position (m) and n ascending depths (n,), m.
+    position_m: (x, y) of the fingertip in the sheet frame.
+    depths_m: ascending depths (n,).
     """
 
     rubber: Rubber
@@ -167,8 +167,7 @@ def solve_indentation_basis(
         solve_indentation, pushes
     ),
 ) -> IndentationBasis:
-    """Compute the shape of the membrane for pushes at all interpolation nodes, and reduce the
-    shapes to modes.
+    """Solve pushes at all interpolation nodes, and reduce the shapes of the membrane to modes.
 
     solve_all: function that solves the pushes in this process or in other processes. On one core,
         this takes 45 s.
@@ -233,8 +232,7 @@ def solve_indentation(push: IndentationCase) -> Floats:
 
 
 def _decompose(samples: Floats) -> tuple[Floats, Floats]:
-    """Decompose n samples (n, size) into m modes (m, size), and return modes and coefficients (n,
-    m).
+    """Return m modes (m, size) of n samples (n, size), and their coefficients (n, m).
 
     m is the smallest number of modes for which the error is below `MAX_TRUNCATION_RMS_M`.
     """
@@ -249,9 +247,7 @@ def _decompose(samples: Floats) -> tuple[Floats, Floats]:
 
 
 def _grade_coordinates(focus_m: float, half_m: float) -> Floats:
-    """Return coordinates (2 HALF_CELLS + 1,), m, from -half_m to half_m, which are densest at
-    focus_m.
-    """
+    """Return coordinates (2 HALF_CELLS + 1,), m, from -half_m to half_m, densest at focus_m."""
     fractions = np.sinh(GRADING * np.linspace(0.0, 1.0, HALF_CELLS + 1)) / np.sinh(GRADING)
     before = focus_m - (half_m + focus_m) * fractions[::-1]
     after = focus_m + (half_m - focus_m) * fractions

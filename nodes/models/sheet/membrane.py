@@ -232,9 +232,7 @@ class _Grid:
         return float(self.volume @ relaxed_energy(large, small, self.c1, self.c2)[0])
 
     def gradient(self, positions: Floats) -> Floats:
-        """Return the gradient (3 nodes,) of the elastic energy, which consists of the nodal forces
-        (N).
-        """
+        """Return the gradient (3 n,) of the elastic energy: internal forces, N, at n nodes."""
         deformed, c = self.strain(positions)
         stress, _ = stress_and_tangent(c, self.c1, self.c2, tangent=False)
         volume = self.volume[:, None, None]
@@ -242,17 +240,13 @@ class _Grid:
         return self._assemble(local)
 
     def _assemble(self, local: Floats) -> Floats:
-        """Add up the forces (points, 4, 3) of the integration points at each node, and return nodal
-        forces (3 nodes,), N.
-        """
+        """Sum the forces (points, 4, 3), N, of integration points to forces (3 n,) at n nodes."""
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
     def _scatter(self, blocks: Floats) -> Floats:
-        """Add up the stiffnesses (points, ...) of the integration points, and return the entries of
-        the sparse stiffness matrix.
-        """
+        """Sum the stiffnesses of integration points to entries of the sparse stiffness matrix."""
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
@@ -260,11 +254,11 @@ class _Grid:
     def system(
         self, positions: Floats, added: Floats, free: Bools, damping: float
     ) -> tuple[Floats, scipy.sparse.csc_array]:
-        """Return the energy gradient (3 nodes,), N, and the sparse stiffness matrix (N/m) of the
-        free coordinates.
+        """Return the energy gradient (3 n,), N, and the sparse stiffness matrix, N/m, of n nodes.
 
-        added (nodes, 3, 3): stiffness of the contact, N/m.
-        free (3 nodes,): whether each coordinate of the nodes is free to move.
+        added (n, 3, 3): stiffness of the contact, N/m.
+        free (3 n,): whether each coordinate of the nodes is free to move. Only free coordinates are
+            in the matrix.
         damping: value (N/m) that is added to the diagonal.
         """
         deformed, c = self.strain(positions)
@@ -299,8 +293,7 @@ class _Grid:
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the larger and the smaller eigenvalues (n,) of n tensors C (n, 2, 2), and directions
-    (n, 2).
+    """Return larger and smaller eigenvalues (n,) of tensors C (n, 2, 2), and directions (n, 2).
 
     The directions are the unit eigenvectors of the larger eigenvalues.
     """
@@ -382,9 +375,7 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _FingerContact:
-    """A penalty model of the contact between mesh nodes and the fingertip. Nodes that stick to the
-    fingertip have no penalty.
-    """
+    """A penalty model of the contact of mesh nodes with the fingertip, except sticking nodes."""
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
         self.centre, self.radius, self.sticking = centre, radius_m, sticking
@@ -403,9 +394,7 @@ class _FingerContact:
         return 0.5 * float(self._penalty @ self._penetration(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the gradient (nodes, 3) and a positive semidefinite Hessian (nodes, 3, 3) of the
-        penalty energy.
-        """
+        """Return the gradient (n, 3), N, and a positive semidefinite Hessian (n, 3, 3), N/m."""
         inside, outward = self._penetration(positions)
         stiff = np.where(inside > 0.0, self._penalty, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(
@@ -416,8 +405,7 @@ class _FingerContact:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium from the current indentation, scaled to the new depth. For the
-    first step, the indentation is a cone.
+    """Predict the next equilibrium by scaling the current deflection; start with a cone.
 
     push: current depth and its increase in this step (m).
     """
@@ -434,8 +422,7 @@ def _predict_state(
 
 
 def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None) -> Floats:
-    """Compute the equilibrium of the sheet, starting from the node positions `start`. Clamped and
-    sticking nodes are fixed.
+    """Compute the equilibrium, starting at `start`, with clamped and sticking nodes fixed.
 
     Raises NoEquilibriumError if the iteration does not converge.
     """

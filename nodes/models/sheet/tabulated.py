@@ -32,17 +32,18 @@ Curve = Callable[[Floats], Floats]
 """A function of n depths (n,), m."""
 
 MAX_CURVES = 256
-"""The maximum number of stored curves. A planner uses some tens: the same pushes for every fit."""
+"""The maximum number of stored curves. A planner needs some tens: all fits use the same pushes."""
 
 
 @dataclass(frozen=True, slots=True)
 class TabulatedSheetModel:
-    """A model that multiplies the force of the scaled model by ratios from a table.
+    """A model that multiplies the force of a `ScaledSheetModel` by ratios from a table.
 
     stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes of the table. Positions are
         in only one quadrant, because the sheet is symmetric.
-    ratios (a, b, c, d): ratios. They are interpolated linearly over stretches and positions, and by
-        monotone cubics over depths. Beyond the ends of an axis, they are constant.
+    ratios (a, b, c, d): entries of the table. The interpolation is linear over stretches and
+        positions, and uses monotone cubics over depths. Beyond the ends of an axis, the ratios are
+        constant.
 
     Raises ValueError if an axis is not ascending, or if a ratio is invalid.
     """
@@ -93,7 +94,7 @@ class TabulatedSheetModel:
         )
 
     def _ratios_of(self, push: SheetPush) -> Floats:
-        """Return the ratios (b,) at the depths of the table."""
+        """Return the ratios (b,) for a push at the depths of the table."""
         x, y = map(abs, push.position_m)
         ratios = _interpolate_linear(self.stretches, push.stretch_ratio, self.ratios)
         ratios = _interpolate_linear(self.xs_m, x, np.moveaxis(ratios, 1, 0))

@@ -68,9 +68,7 @@ class SlackSheet(Protocol):
 
 
 def edge_force_n(stretch_ratio: float, sheet: SlackSheet, *, mooney_ratio: float = 0.0) -> float:
-    """Return the force (N) on each clamped edge of a sheet that nothing touches. The force is 0 if
-    the sheet is slack.
-    """
+    """Return the force (N) on each clamped edge of an untouched sheet, or 0 if it is slack."""
     return _area_modulus_n(sheet) * strain_measure(stretch_ratio, mooney_ratio)
 
 
@@ -104,9 +102,7 @@ def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
 
 
 def edge_force_for_stiffness(stiffness_n_per_m: float, *, width_m: float) -> float:
-    """Return the edge force (N) at which a small push at the sheet's centre has a given
-    stiffness.
-    """
+    """Return the edge force (N) at which a small push at the centre has a given stiffness."""
     return stiffness_n_per_m * width_m / PUSH_FACTOR
 
 
