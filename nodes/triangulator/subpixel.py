@@ -28,9 +28,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from flexsheet.nodes.arrays import Floats, Image
+from flexsheet.nodes.arrays import Bools, Floats, Image
 from flexsheet.nodes.triangulator.ellipse import integrate_ellipse
 
 X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range(10)
@@ -221,14 +220,15 @@ def _fit(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> list[DiscF
             covariance,
             fitness,
             is_ellipse=render is _render_ellipse,
-            converged=solved.converged and shift < MAX_SHIFT_PX,
+            converged=converged and shift < MAX_SHIFT_PX,
         )
-        for parameters, corner, covariance, fitness, shift in zip(
+        for parameters, corner, covariance, fitness, shift, converged in zip(
             solved.found.tolist(),
             cutouts.corners,
             covariances,
             _fit_residuals(solved),
             shifts,
+            solved.converged.tolist(),
             strict=True,
         )
     ]
@@ -244,6 +244,7 @@ class DiscSolution:
     information: Fisher information plus prior (n, parameters, parameters).
     gains: first-order reduction (n, parameters) of the weighted squared residuals by the last step
         of each parameter.
+    converged: whether each disc (n,) has converged.
     """
 
     found: Floats
@@ -251,7 +252,7 @@ class DiscSolution:
     weights: Floats
     information: Floats
     gains: Floats
-    converged: bool
+    converged: Bools
 
 
 def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolution:
@@ -261,7 +262,7 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
     """
     prior_weights = PRIOR_WEIGHTS[: start.shape[1]]
     prior = np.diag(prior_weights)
-    found, converged, used = start.copy(), False, cutouts.weights
+    found, used = start.copy(), cutouts.weights
     for _ in range(ITERATIONS):
         model, slopes = render(found, cutouts.x, cutouts.y)
         residuals = cutouts.levels - model
@@ -276,12 +277,11 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
         found += step
         bounded = found[:, RADIUS : BLUR + 1]
         np.maximum(np.minimum(bounded, MAX_SHAPE), MIN_SHAPE, out=bounded)
-        is_settled = (np.abs(shape) < CONVERGED_STEP_PX).all()
+        converged = (np.abs(shape) < CONVERGED_STEP_PX).all(axis=1)
         if render is _render_ellipse:
             _bound_elongation(found)
-            is_settled &= (np.abs(step[:, ELONGATION]) < CONVERGED_ELONGATION_PX).all()
-        if is_settled:
-            converged = True
+            converged &= (np.abs(step[:, ELONGATION]) < CONVERGED_ELONGATION_PX).all(axis=1)
+        if converged.all():
             break
     return DiscSolution(found, residuals, used, information, gradient * step, converged)
 
@@ -329,7 +329,7 @@ class DiscCutouts:
     weights: Floats
     x: Floats
     y: Floats
-    white: NDArray[np.bool_] | None
+    white: Bools | None
 
 
 def _cut_out_discs(
