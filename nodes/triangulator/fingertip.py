@@ -332,15 +332,18 @@ def _match_blobs(
 class RefinedPair:
     """A pair of blobs, and its left and right marker after the refinement to subpixel accuracy.
 
-    rejection_reason: reason why the pair cannot be the finger's marker; None if it can.
-    cost: cost of the blob pair, plus the squared deviations of the refined radii, each divided by
-        its variance.
+    rejection_reason: reason why the pair cannot be the marker; None if the marker is valid.
+    cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
+        standard deviations.
+    measured: triangulated marker; None if the pair cannot be the marker, or if the rays through the
+        centres do not meet.
     """
 
     pair: BlobPair
     markers: tuple[Marker, Marker]
     rejection_reason: FingertipReason | None
     cost: float
+    measured: TriangulatedPoint | None = None
 
 
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
@@ -363,8 +366,8 @@ def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetect
             rivals[0].rejection_reason or "merged", _triangulate(inputs, rivals[0].markers), markers
         )
     if len(valid) > 1 and valid[1].cost < valid[0].cost + AMBIGUITY_MARGIN:
-        return StereoDetection("two_markers", _triangulate(inputs, valid[0].markers), markers)
-    reason, measured = _validate(inputs, _triangulate(inputs, valid[0].markers))
+        return StereoDetection("two_markers", valid[0].measured, markers)
+    reason, measured = _validate(inputs, valid[0].measured)
     return StereoDetection(reason, measured, markers)
 
 
@@ -374,8 +377,11 @@ def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[Refi
     found = []
     for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
         rejection_reason = _rejection_reason(inputs, pair, markers)
-        cost = math.inf if rejection_reason else pair.cost + _size_cost(inputs, pair, markers)
-        found.append(RefinedPair(pair, markers, rejection_reason, cost))
+        if rejection_reason is not None:
+            found.append(RefinedPair(pair, markers, rejection_reason, math.inf))
+            continue
+        cost = pair.cost + _size_cost(inputs, pair, markers)
+        found.append(RefinedPair(pair, markers, None, cost, _triangulate(inputs, markers)))
     return found
 
 
@@ -391,7 +397,7 @@ def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> lis
         flat = _check_flat_pair(inputs, markers)
         if flat is not None:
             cost = pair.cost + _size_cost(inputs, pair, flat)
-            found.append(RefinedPair(pair, flat, None, cost))
+            found.append(RefinedPair(pair, flat, None, cost, _triangulate(inputs, flat)))
     return found
 
 
@@ -461,7 +467,7 @@ def _unique_candidates(
             unique.append(one)
     found = []
     for one in unique:
-        reason, measured = _validate(inputs, _triangulate(inputs, one.markers))
+        reason, measured = _validate(inputs, one.measured)
         if reason == "ok" and measured is not None:
             found.append(Candidate(measured, _appearance(one.pair)))
     return tuple(found)
