@@ -1,13 +1,13 @@
 """Measure how smooth and how fast the soft body is, by a fingertip that slides over its skin.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body [--table [--cold]] [--json]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body [--table [--cold] [--spacing M]] [--json]
 
 Without --table, linear bodies with several spacings of the skin are measured. With --table, the
 nonlinear table of the demo's cylinder is measured: the errors of its force and of the forces of the
 other methods against the stored force of an independent solver; its errors and those of the linear
 method against Newton solutions on finer meshes, at points that it was not computed from; and the
 same slides. With --cold, the table is first computed without a cache, which takes minutes, and then
-read from the cache, to measure both times.
+read from the cache, to measure both times. --spacing is the distance of its skin nodes.
 
 The fingertip moves 6 mm in each of three directions at constant depth, 0.02 mm per step. The result
 contains for every mesh and depth the mean force (beside Hertz's), its range, the largest jump of
@@ -320,11 +320,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--table", action="store_true", help="measure the nonlinear table")
     parser.add_argument("--cold", action="store_true", help="measure the time without a cache")
+    parser.add_argument(
+        "--spacing", type=float, default=DEMO_SPACING_M, help="distance of the table's nodes, m"
+    )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     scene = load_scene(SCENE_FILE)
     if options.table:
-        report = evaluate_table(scene, DEMO_SPACING_M, cold=options.cold)
+        report = evaluate_table(scene, options.spacing, cold=options.cold)
         print_report(report, "force_errors", "pushes", "slides", as_json=options.json)
         return
     meshes = [measure(scene, spacing_m) for spacing_m in SPACINGS_M]
