@@ -425,7 +425,7 @@ def test_the_number_of_nodes_is_foreseen(name: str) -> None:
         assert 0.4 < nodes / len(mesh(name, spacing).nodes) < 2.5
 
 
-@pytest.mark.parametrize("name", long_except(SHAPES, "sphere", "plane"))
+@pytest.mark.parametrize("name", long_except(sorted(set(SHAPES) - {"plane"}), "sphere"))
 def test_a_base_holds_the_lowest_skin(name: str) -> None:
     support = {"kind": "base", "height_m": 0.012, "down_world": [0.0, -2.0, 0.0]}
     one = scene(SHAPES[name], support=support)

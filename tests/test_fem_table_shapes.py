@@ -51,7 +51,16 @@ def pushed(body: SceneBody, x: float, y: float, depth: float) -> tuple[Response,
     return body.method.respond(push), push
 
 
-def test_it_deforms_at_the_push_like_the_linear_method(
+def hertz_n(body: SceneBody, push: ContactQuery) -> float:
+    """Return Hertz' force on a finger that is pushed into a sphere or a flat side, N."""
+    curvature = float(np.linalg.norm(body.shape.closest(push.surface).shape_operator, 2))
+    radius_m = 1.0 / (1.0 / 0.007 + curvature)
+    modulus_pa, poisson = 4000.0, 0.45
+    factor = 4.0 / 3.0 * modulus_pa / (1.0 - poisson**2)
+    return float(factor * np.sqrt(radius_m) * push.depth_m**1.5)
+
+
+def test_it_deforms_at_the_push_like_the_linear_method_with_the_force_of_hertz(
     both: tuple[Body, SceneBody],
 ) -> None:
     linear, table = both
@@ -60,10 +69,11 @@ def test_it_deforms_at_the_push_like_the_linear_method(
         other, _ = pushed(linear.soft, x, y, 0.0025)
         assert answer.in_range
         inward = -(answer.displacement @ push.normal.astype(np.float32))
-        assert inward.max() == pytest.approx(0.0025, rel=0.2)
+        # The nodes are 6.5 mm apart, so that none may be at the deepest point.
+        assert 0.6 * 0.0025 < inward.max() < 1.2 * 0.0025
         deepest = table.rest[int(inward.argmax())]
         assert np.linalg.norm(deepest - push.surface) < 0.007
-        assert answer.force_n @ push.normal == pytest.approx(other.force_n @ push.normal, rel=0.25)
+        assert answer.force_n @ push.normal == pytest.approx(hertz_n(table, push), rel=0.15)
         away = np.linalg.norm(table.rest - push.surface, axis=1) > 0.0105
         apart = np.linalg.norm(answer.displacement - other.displacement, axis=1)
         assert apart[away].max() < 0.6e-3  # elements of 13 mm

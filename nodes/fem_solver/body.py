@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexsheet.messages.scene import Cylinder, Scene, StripSupport, require_material
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.fem_solver.closest_contact import (
@@ -21,6 +21,7 @@ from flexsheet.nodes.fem_solver.contact import LinearSoftBody, Response, SoftBod
 from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec, mesh_spec, world_from_mesh
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from flexsheet.nodes.fem_solver.precompute_table import TableSpec
+from flexsheet.nodes.fem_solver.snapshots import has_focused_meshes
 from flexsheet.nodes.fem_solver.table import Table, TableSoftBody
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.models.interpolation import interpolate_path
@@ -38,11 +39,12 @@ FORCE_ERROR_RATIOS = {
 }
 """The estimated relative errors of each method's contact force at the depths `ERROR_DEPTHS_M`.
 
-The first row applies to cylinders on a strip support, for which the forces of a table are
-corrected. The second row applies to other bodies, whose tables use the linear response at small
-depths. The errors are valid for 95 % of the touchable nodes, for the finger of the demo and a skin
-spacing of 4.5 mm. The first row was measured by `python -m benchmarks.soft_body --table`. The
-second row is derived from the first row and was not measured.
+The first row applies to bodies with meshes that are fine near the push, for which the forces of a
+table are corrected. The second row applies to cylinders without a strip support, whose tables use
+the linear response at small depths. The errors are valid for 95 % of the touchable nodes, for the
+finger of the demo and a skin spacing of 4.5 mm. The first row was measured on the demo's cylinder
+by `python -m benchmarks.soft_body --table`. The second row is derived from the first row and was
+not measured.
 """
 NOTED_DEPTHS_M = (0.001, 0.005)
 """The push depths (m) for which the node's status states the estimated force error."""
@@ -51,8 +53,8 @@ NOTED_DEPTHS_M = (0.001, 0.005)
 def state_force_error_ratio(method: str, mesh: MeshSpec, depth_m: float) -> float:
     """Return the estimated relative error of a method's contact force at a push depth."""
     corrected, uncorrected = FORCE_ERROR_RATIOS[method]
-    on_strip = isinstance(mesh.geometry, Cylinder) and isinstance(mesh.support, StripSupport)
-    return float(np.interp(depth_m, ERROR_DEPTHS_M, corrected if on_strip else uncorrected))
+    errors = corrected if has_focused_meshes(mesh) else uncorrected
+    return float(np.interp(depth_m, ERROR_DEPTHS_M, errors))
 
 
 def make_soft_body_spec(

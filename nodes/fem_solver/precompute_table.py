@@ -53,7 +53,7 @@ from flexsheet.nodes.models.shapes import make_shape
 
 T = TypeVar("T")
 
-VERSION = 5
+VERSION = 6
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
 """The numbers of progress steps for each finished snapshot and for each finished table node."""

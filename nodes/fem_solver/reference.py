@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flexsheet.messages.scene import Cylinder, Scene
+from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import (
     CheckpointStore,
@@ -80,7 +80,9 @@ def make_focused_job(
     support such meshes, all touchable skin has this spacing.
     """
     spacing = ratio * scene.finger.radius_m
-    spec = replace(body.spec.mesh, skin_spacing_m=spacing)
+    spec = body.spec.mesh
+    if not snapshots.has_focused_meshes(spec):
+        spec = replace(spec, skin_spacing_m=spacing)
     job = snapshots.make_snapshot_job(
         spec,
         build_mesh(spec),
@@ -231,8 +233,3 @@ def load_full_table(
     """Return the body with its full nonlinear table, or None if the cache does not contain it."""
     table = load_cached(make_table_cache(make_table_spec(scene, body.spec)), cache_dir)
     return None if table is None else attach_table(body, scene, model, table)
-
-
-def has_focused_meshes(body: SceneBody) -> bool:
-    """Return whether the shape supports meshes that are fine only near the finger."""
-    return isinstance(body.spec.mesh.geometry, Cylinder)

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Cylinder, StripSupport
 from flexsheet.nodes.arrays import Bools, Floats, Ints, Singles
 from flexsheet.nodes.fem_solver.mesh.cylinder import Focus, cylinder_mesh
-from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec
+from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec, build_mesh, min_extent_m
+from flexsheet.nodes.fem_solver.mesh.grading import FinePoint
 from flexsheet.nodes.fem_solver.mesh.solid import SAME_M, SolidMesh, nodes_in_planes, skin_faces
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
@@ -51,7 +52,14 @@ FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
 """The parameters of the fine mesh that corrects the forces. The first is the ratio of its skin
 spacing to the skin spacing of a snapshot. The second is the radius of the fine region, in finger
 radii. The third is the growth of the element size per distance (m/m). `FINE_DEPTHS_M` contains the
-push depths."""
+push depths.
+"""
+LATTICE_GROWTH = 0.5
+"""The increase of the element size per distance (m/m) from the pushed point, in meshes of bisected
+lattices. Their elements are up to half as large as required."""
+MAX_ELEMENT_RATIO = 0.35
+"""The maximum element size in meshes of bisected lattices, as a fraction of the body's minimum
+extent."""
 SAME_RATIO = 1e-6
 
 
@@ -283,9 +291,9 @@ def make_snapshot_job(
 ) -> SnapshotJob:
     """Return the job for the pushes at a sample point.
 
-    For a cylinder on a strip support, the job has a new mesh that is fine near the push. Otherwise,
-    it has the given mesh. spacing_m: skin spacing of the new mesh; if it is None, the default for
-    tables is used. depths_m: push depths; if it is None, `DEPTHS_M` is used.
+    The job has a new mesh that is fine near the push if the shape supports such meshes. Otherwise,
+    it has the given mesh. spacing_m: skin spacing of the new mesh; if it is None,
+    the default for tables is used. depths_m: push depths; if it is None, `DEPTHS_M` is used.
     """
     spacing_m = spacing_m or _spacing_m(spec, finger_radius_m)
     focused = _make_focused_mesh(spec, sample, spacing_m, NEAR_RATIO * finger_radius_m, None)
@@ -295,7 +303,7 @@ def make_snapshot_job(
         poisson_ratio=poisson_ratio,
         finger_radius_m=finger_radius_m,
         depths_m=DEPTHS_M if depths_m is None else depths_m,
-        mirror_axes=() if focused is None else _mirror_axes(sample),
+        mirror_axes=() if focused is None else _mirror_axes(spec, sample),
     )
 
 
@@ -304,7 +312,7 @@ def make_fine_job(
 ) -> SnapshotJob | None:
     """Return the job for pushes on a fine mesh, whose forces correct those of the nonlinear table.
 
-    Return None unless the body is a cylinder on a strip support.
+    Return None if the shape does not support meshes that are fine near one point.
     """
     spacing_m = FINE_RATIO * _spacing_m(spec, finger_radius_m)
     near_m = FINE_NEAR_RATIO * finger_radius_m
@@ -317,7 +325,7 @@ def make_fine_job(
         poisson_ratio=poisson_ratio,
         finger_radius_m=finger_radius_m,
         depths_m=FINE_DEPTHS_M,
-        mirror_axes=_mirror_axes(sample),
+        mirror_axes=_mirror_axes(spec, sample),
     )
 
 
@@ -325,18 +333,31 @@ def _spacing_m(spec: MeshSpec, finger_radius_m: float) -> float:
     return min(SPACING_RATIO * finger_radius_m, spec.skin_spacing_m)
 
 
+def has_focused_meshes(spec: MeshSpec) -> bool:
+    """Return whether the shape supports meshes that are fine only near one point."""
+    return not isinstance(spec.geometry, Cylinder) or isinstance(spec.support, StripSupport)
+
+
 def _make_focused_mesh(
     spec: MeshSpec, sample: SamplePoint, spacing_m: float, near_m: float, growth: float | None
 ) -> SolidMesh | None:
     """Return a mesh that is fine near a sample point.
 
-    Return None unless the body is a cylinder on a strip support. spacing_m: skin spacing near the
-    point. near_m: distance from the point within which the mesh has this spacing. growth: increase
-    of the element size per distance (m/m); if it is None, the default is used.
+    Return None if the shape does not support such meshes. spacing_m: skin spacing near the point.
+    near_m: distance from the point within which the mesh has this spacing. growth: increase of the
+    element size per distance (m/m); if it is None, the default is used.
     """
+    if not has_focused_meshes(spec):
+        return None
     geometry, support = spec.geometry, spec.support
     if not (isinstance(geometry, Cylinder) and isinstance(support, StripSupport)):
-        return None
+        x, y, z = (float(value) for value in sample.point)
+        fine_point = FinePoint(
+            (x, y, z), near_m, growth or LATTICE_GROWTH, MAX_ELEMENT_RATIO * min_extent_m(spec)
+        )
+        return build_mesh(
+            spec, replace(spec.grading, skin_spacing_m=spacing_m, fine_point=fine_point)
+        )
     return cylinder_mesh(
         radius_m=geometry.radius_m,
         length_m=geometry.length_m,
@@ -349,12 +370,17 @@ def _make_focused_mesh(
             near_m=near_m,
             growth=growth,
         ),
-        mirror_axes=_mirror_axes(sample),
+        mirror_axes=_mirror_axes(spec, sample),
     )
 
 
-def _mirror_axes(sample: SamplePoint) -> tuple[int, ...]:
-    """Return the axes (0: x = 0, 1: y = 0) of a cylinder's planes of symmetry through a point."""
+def _mirror_axes(spec: MeshSpec, sample: SamplePoint) -> tuple[int, ...]:
+    """Return the axes of the planes of symmetry of a cylinder that contain the sample point.
+
+    Only the planes x = 0 and y = 0 are considered. For other shapes, the whole body is meshed.
+    """
+    if not isinstance(spec.geometry, Cylinder):
+        return ()
     return tuple(
         axis for axis in (0, 1) if max(abs(sample.point[axis]), abs(sample.normal[axis])) < SAME_M
     )

@@ -23,15 +23,19 @@ MAX_TETRAHEDRA = 300_000
 _OFFSET = 1 << 20
 
 
-def make_lattice(half_cells: tuple[int, int, int]) -> tuple[Ints, Ints]:
-    """Return vertices (n, 3) and tetrahedra (e, 4) of a lattice of cubic cells about the origin.
+Cells = tuple[int, int, int]
+"""Numbers of lattice cells along the three axes."""
 
-    half_cells: half the number of cells along each axis. The lattice is symmetric about its three
-    central planes, and no tetrahedron has two boundary faces.
+
+def make_lattice(below: Cells, above: Cells | None = None) -> tuple[Ints, Ints]:
+    """Return vertices (n, 3) and tetrahedra (e, 4) of a lattice of cubic cells around the origin.
+
+    below, above: number of cells along each axis with negative and with positive coordinates. If
+    `above` is None, both numbers are equal. The planes x = 0, y = 0 and z = 0 are planes of
+    symmetry as far as both sides extend, and no tetrahedron has two boundary faces.
     """
-    cells = np.stack(
-        np.meshgrid(*(np.arange(-n, n) for n in half_cells), indexing="ij"), axis=-1
-    ).reshape(-1, 3)
+    ranges = (np.arange(-low, high) for low, high in zip(below, above or below, strict=True))
+    cells = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)
     sign = np.where(cells >= 0, 1, -1)
     near = np.where(cells >= 0, cells, cells + 1)
     corners = []

@@ -165,8 +165,9 @@ def _cover_with_lattice(
 
     def too_large(vertices: Ints, tetrahedra: Ints) -> Bools:
         distance, normals, bend = field.at(vertices)
-        length = longest_edges(field.positions(vertices), tetrahedra)
-        sizes = grading.sizes(normals, -distance)[tetrahedra].min(axis=1)
+        points = field.positions(vertices)
+        length = longest_edges(points, tetrahedra)
+        sizes = grading.sizes(points, normals, -distance)[tetrahedra].min(axis=1)
         corners = distance[tetrahedra]
         at_surface = np.abs(corners).min(axis=1) < SURFACE_DISTANCE_RATIO * length
         bent = limit_sizes_by_curvature(sizes, bend[tetrahedra].max(axis=1), grading)

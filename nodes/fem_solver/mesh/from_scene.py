@@ -195,7 +195,8 @@ def estimate_node_count(spec: MeshSpec, shape: Shape) -> int:
         found = shape.closest(points)
         depth, normals = -found.height_m, found.normal
         bend = np.sqrt(np.square(found.shape_operator).sum(axis=(1, 2)))
-    sizes, on_skin = spec.grading.sizes(normals, depth), spec.grading.sizes(normals, 0.0 * depth)
+    sizes = spec.grading.sizes(points, normals, depth)
+    on_skin = spec.grading.sizes(points, normals, 0.0 * depth)
     if isinstance(spec.geometry, Mesh):
         on_skin = limit_sizes_by_curvature(on_skin, bend, spec.grading)
     weight = float((high - low).prod()) / len(points)
@@ -214,6 +215,12 @@ def estimate_node_count(spec: MeshSpec, shape: Shape) -> int:
     return nodes
 
 
+def min_extent_m(spec: MeshSpec) -> float:
+    """Return the minimum extent (m) of the bounding box of the meshed volume."""
+    low, high = _box(spec)
+    return float((high - low).min())
+
+
 def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
     """Return the lower and the upper corner (3,), m, of the bounding box of the meshed volume."""
     low, high = GEOMETRIES[spec.geometry.shape].bounds_m(spec.geometry)
@@ -221,40 +228,46 @@ def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
     return low - margin, high + np.array([margin, margin, 0.0])
 
 
-def build_mesh(spec: MeshSpec) -> SolidMesh:
+def build_mesh(spec: MeshSpec, grading: Grading | None = None) -> SolidMesh:
     """Build the mesh that a specification describes, in the mesh frame (`world_from_mesh`).
+
+    grading: element sizes of an object that is no cylinder; if it is None, those of the
+    specification are used.
 
     Raises UnfitMeshError if the skin spacing does not fit the object or requires more than
     `MAX_NODES` nodes. It is also raised if the object is too thin for the elements, or if the
     support fixes too few nodes or all touchable skin.
     """
-    geometry = spec.geometry
+    geometry, grading = spec.geometry, grading or spec.grading
     shape = make_shape(dict(geometry))
     estimate_node_count(spec, shape)
     if isinstance(geometry, Cylinder):
         return _cylinder(geometry, spec)
     if isinstance(geometry, Plane):
-        nodes, elements = mesh_slab(geometry, spec.slab_depth_m, spec.grading)
+        nodes, elements = mesh_slab(geometry, spec.slab_depth_m, grading)
         normals = _slab_normals(nodes)
         half = 0.5 * np.array([geometry.width_m, geometry.height_m]) + 1e-9
         touchable = (normals[:, 2] > 0.0) & (np.abs(nodes[:, :2]) <= half).all(axis=1)
     else:
         cuboid_map = GEOMETRIES[geometry.shape].cuboid_map
         if cuboid_map is not None:
-            nodes, elements = mesh_by_map(cuboid_map(geometry, shape), shape, spec.grading)
+            nodes, elements = mesh_by_map(cuboid_map(geometry, shape), shape, grading)
         else:
-            nodes, elements = fit_mesh(shape, *_box(spec), spec.grading)
+            nodes, elements = fit_mesh(shape, *_box(spec), grading)
         if isinstance(geometry, Mesh):
             _require_volume(geometry, nodes, elements, spec)
         skin = np.unique(boundary_faces(elements))
         normals = np.zeros_like(nodes)
         normals[skin] = shape.closest(nodes[skin]).normal
         touchable = np.ones(len(nodes), dtype=bool)
-    touchable &= spec.grading.touchable(normals)
+    touchable &= grading.touchable(normals)
     skin = np.unique(boundary_faces(elements))
     fixed = np.zeros(len(nodes), dtype=bool)
     fixed[skin] = _select_fixed(spec, nodes[skin], normals[skin])
-    return make_solid_mesh(nodes, elements, touchable=touchable, fixed=fixed, normals=normals)
+    mesh = make_solid_mesh(nodes, elements, touchable=touchable, fixed=fixed, normals=normals)
+    if isinstance(geometry, Plane):
+        _require_fixed_back(spec, fixed[skin], normals[skin])
+    return mesh
 
 
 def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
@@ -296,6 +309,20 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
         towards_user=object_from_mesh @ np.array(spec.towards_user),
         down=np.array(spec.down),
     )
+
+
+def _require_fixed_back(spec: MeshSpec, fixed: Bools, normals: Floats) -> None:
+    """Raise UnfitMeshError unless the whole back of the slab that represents a half-space is fixed.
+
+    A slab that is fixed in a part of its back only bends, and is far softer than a half-space.
+    """
+    back = normals[:, 2] < 0.0
+    if not fixed[back].all():
+        raise UnfitMeshError(
+            f"object.support: the support of the kind {spec.support.kind} fixes "
+            f"{fixed[back].sum()} of {back.sum()} nodes at the back of the plane's slab, which "
+            "represents a half-space; give support: {kind: strip, angle_rad: 1.0}"
+        )
 
 
 def _slab_normals(nodes: Floats) -> Floats:

@@ -21,17 +21,34 @@ surfaces."""
 
 
 @dataclass(frozen=True, slots=True)
+class FinePoint:
+    """A surface point around which a mesh is fine.
+
+    point_m: position in the mesh frame. near_m: distance within which elements have the minimum
+    size. growth: increase of the element size per distance beyond `near_m` (m/m). max_element_m:
+    maximum element size.
+    """
+
+    point_m: tuple[float, float, float]
+    near_m: float
+    growth: float
+    max_element_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class Grading:
     """The element sizes of a mesh.
 
     Skin can be touched if the angle between its normal and the unit vector `towards_user` is at
     most `touch_angle_rad`. The nodes of touchable skin are `skin_spacing_m` apart. Elements
-    elsewhere are larger.
+    elsewhere are larger. fine_point: point near which alone the nodes have this spacing; if it is
+    None, all touchable skin has this spacing.
     """
 
     skin_spacing_m: float
     touch_angle_rad: float
     towards_user: tuple[float, float, float]
+    fine_point: FinePoint | None = None
 
     @property
     def element_m(self) -> float:
@@ -45,11 +62,17 @@ class Grading:
         """Return whether the finger can touch skin with the unit normals (n, 3)."""
         return np.asarray(self._angles(normals) <= self.touch_angle_rad + 1e-9)
 
-    def sizes(self, normals: Floats, depth_m: Floats) -> Floats:
-        """Return the required element sizes (n,), m, at n points of the object.
+    def sizes(self, points: Floats, normals: Floats, depth_m: Floats) -> Floats:
+        """Return the required element sizes (n,), m, at points (n, 3), m, in the mesh frame.
 
-        normals (n, 3): unit normal of the skin nearest to each point. depth_m (n,): depth below it.
+        For each of the n points, normals (n, 3) contains the unit normal of the nearest skin, and
+        depth_m (n,) contains the depth below this skin.
         """
+        if self.fine_point is not None:
+            fine = self.fine_point
+            distance = np.linalg.norm(points - np.array(fine.point_m), axis=1)
+            grown = self.element_m + fine.growth * np.maximum(distance - fine.near_m, 0.0)
+            return np.asarray(np.minimum(grown, max(fine.max_element_m, self.element_m)))
         behind = np.clip((self._angles(normals) - self.touch_angle_rad) / RAMP_RAD, 0.0, 1.0)
         coarser = 1.0 + (BACK_COARSENING - 1.0) * behind
         return np.asarray(self.element_m * coarser + DEPTH_GROWTH * np.maximum(depth_m, 0.0))

@@ -18,7 +18,7 @@ import numpy as np
 
 from flexsheet.messages.scene import Plane
 from flexsheet.nodes.arrays import Bools, Floats, Ints
-from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
+from flexsheet.nodes.fem_solver.mesh.bisection import CELL, Cells, bisect, make_lattice
 from flexsheet.nodes.fem_solver.mesh.curving import curve_edges
 from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
 from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
@@ -44,13 +44,12 @@ MAX_SURPLUS_RATIO = 2.0
 """The maximum number of elements of a lattice, relative to the lattice with fewest elements."""
 
 
-def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-    """Map lattice vertices (n, 3) to points (n, 3), m, in the solid.
+def map_lattice(template: CuboidMap, u: Floats) -> tuple[Floats, Floats]:
+    """Map lattice vertices with the scaled coordinates u (n, 3) to points (n, 3), m, in the solid.
 
-    half_cells (3,): half the number of lattice cells along each axis. The second result contains
-    the points (n, 3), m, at which rays from the centre through the vertices intersect the surface.
+    The second result contains the points (n, 3), m, at which rays from the centre through the
+    vertices intersect the surface.
     """
-    u = vertices / (CELL * half_cells)
     weight = np.abs(u).max(axis=1, keepdims=True)
     # At the centre w is undefined; any direction may be used.
     w = np.where(weight > 0.0, u / np.maximum(weight, 1e-300), np.array([0.0, 0.0, 1.0]))
@@ -65,16 +64,15 @@ def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Fl
     if the elements of all tried meshes are too distorted.
     """
 
-    def positions(vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-        points, outside = map_lattice(template, vertices, half_cells)
+    def positions(u: Floats) -> tuple[Floats, Floats]:
+        points, outside = map_lattice(template, u)
         depth = np.linalg.norm(outside - points, axis=1)
-        return points, grading.sizes(shape.closest(outside).normal, depth)
+        return points, grading.sizes(points, shape.closest(outside).normal, depth)
 
     # Where a lattice corner is mapped to a round surface, the outermost cells are compressed.
     squeezed = np.pi / 4 if template.is_round else 1.0
-    for corners, tetrahedra, on_hull in _map_lattices(
-        squeezed * template.half_m, grading.element_m, positions
-    ):
+    half = squeezed * template.half_m
+    for corners, tetrahedra, on_hull in _map_lattices(half, half, grading.element_m, positions):
         for anchor in ANCHORS:
             moved = smooth_mesh(
                 corners,
@@ -98,16 +96,22 @@ def mesh_slab(plane: Plane, margin_m: float, grading: Grading) -> tuple[Floats, 
     """Return nodes (n, 3), m, and elements (e, 10) of a slab that represents a half-space.
 
     The slab is `margin_m` deep and extends `margin_m` beyond each side of the touchable rectangle.
+    If the grading has a fine point, the lattice is symmetric about this point. In an asymmetric
+    mesh, the force on a finger there would have a sideways component.
     """
     rectangle = 0.5 * np.array([plane.width_m, plane.height_m])
     half = np.array([*(rectangle + margin_m), 0.5 * margin_m])
+    centre = np.zeros(3)
+    if grading.fine_point is not None:
+        centre[:2] = grading.fine_point.point_m[:2]
+    below, above = half + centre, half - centre
 
-    def positions(vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-        points = vertices / (CELL * half_cells) * half - np.array([0.0, 0.0, half[2]])
+    def positions(u: Floats) -> tuple[Floats, Floats]:
+        points = centre + np.where(u < 0.0, below, above) * u - np.array([0.0, 0.0, half[2]])
         facing = np.broadcast_to(np.array(grading.towards_user), points.shape)
-        return points, grading.sizes(facing, distance_to_rectangle(points, plane))
+        return points, grading.sizes(points, facing, distance_to_rectangle(points, plane))
 
-    corners, tetrahedra, _ = _map_lattices(half, grading.element_m, positions)[0]
+    corners, tetrahedra, _ = _map_lattices(below, above, grading.element_m, positions)[0]
     return add_midside_nodes(corners, tetrahedra)
 
 
@@ -118,36 +122,47 @@ def distance_to_rectangle(points: Floats, plane: Plane) -> Floats:
     return np.asarray(np.linalg.norm(np.column_stack([beside, points[:, 2]]), axis=1))
 
 
-MapFunction = Callable[[Ints, Ints], tuple[Floats, Floats]]
-"""A function that maps lattice vertices (n, 3). Its second argument (3,) is half the number of
-cells along each axis. It returns the mapped points (n, 3), m, and the required element sizes (n,),
-m."""
+MapFunction = Callable[[Floats], tuple[Floats, Floats]]
+"""A function that maps lattice vertices with scaled coordinates (n, 3) between -1 and 1. It returns
+the mapped points (n, 3), m, and the required element sizes (n,), m."""
 
 
 def _map_lattices(
-    half_m: Floats, element_m: float, positions: MapFunction
+    below_m: Floats, above_m: Floats, element_m: float, positions: MapFunction
 ) -> list[tuple[Floats, Ints, Bools]]:
     """Return several mapped lattices, sorted by their number of elements.
 
     The lattices initially have cells of different sizes. They are bisected where smaller elements
     are required. A lattice consists of corners (n, 3), tetrahedra (e, 4), and flags (n,) for
-    corners on the boundary. half_m (3,): half extents. element_m: minimum element size. positions:
-    function that maps the vertices.
+    corners on the boundary. below_m, above_m (3,): extents of the negative and of the positive
+    sides. element_m: minimum element size. positions: function that maps the vertices.
     """
     found: list[tuple[Floats, Ints, Bools]] = []
     for cells in COARSENINGS:
-        half_cells = np.maximum(1, np.ceil(half_m / (cells * element_m) - 1e-9)).astype(np.int64)
-        if found and 48 * half_cells.prod() > MAX_SURPLUS_RATIO * min(len(e) for _, e, _ in found):
+        low, high = (
+            np.maximum(1, np.ceil(extent / (cells * element_m) - 1e-9)).astype(np.int64)
+            for extent in (below_m, above_m)
+        )
+        if found and 6 * (low + high).prod() > MAX_SURPLUS_RATIO * min(len(e) for _, e, _ in found):
             break
 
-        def too_large(vertices: Ints, tetrahedra: Ints, half_cells: Ints = half_cells) -> Bools:
-            points, sizes = positions(vertices, half_cells)
+        def scale(vertices: Ints, low: Ints = low, high: Ints = high) -> Floats:
+            return np.asarray(vertices / (CELL * np.where(vertices < 0, low, high)))
+
+        def too_large(
+            vertices: Ints, tetrahedra: Ints, scale: Callable[[Ints], Floats] = scale
+        ) -> Bools:
+            points, sizes = positions(scale(vertices))
             wanted = EDGE_SIZE_RATIO * sizes[tetrahedra].min(axis=1)
             return np.asarray(longest_edges(points, tetrahedra) > wanted)
 
-        x, y, z = (int(count) for count in half_cells)
-        vertices, tetrahedra = bisect(*make_lattice((x, y, z)), too_large)
-        corners, _ = positions(vertices, half_cells)
-        on_hull = (np.abs(vertices) == CELL * half_cells).any(axis=1)
+        vertices, tetrahedra = bisect(*make_lattice(_cells(low), _cells(high)), too_large)
+        corners, _ = positions(scale(vertices))
+        on_hull = ((vertices == -CELL * low) | (vertices == CELL * high)).any(axis=1)
         found.append((corners, orient_tetrahedra(corners, tetrahedra), on_hull))
     return sorted(found, key=lambda image: len(image[1]))
+
+
+def _cells(counts: Ints) -> Cells:
+    x, y, z = (int(count) for count in counts)
+    return x, y, z
