@@ -40,7 +40,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
 def main() -> None:
-    """Run the command, or nodes if the arguments are `--node CONFIG`."""
+    """Run the `flexsheet` command, or a process with nodes if the arguments are `--node CONFIG`."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
         _run_node(sys.argv[2])
     if len(sys.argv) == 4 and sys.argv[1] == FORK_SERVER_FLAG:
@@ -72,7 +72,7 @@ def _run_node(config_file: str) -> NoReturn:
 
 
 def _shorten_imports() -> None:
-    """Shorten the imports: disable garbage collection, and import structlog without rich."""
+    """Make imports faster: disable garbage collection, and import structlog without rich."""
     gc.disable()
     if "structlog" in sys.modules:
         return
@@ -84,7 +84,7 @@ def _shorten_imports() -> None:
 
 
 def _avoid_garbage_collection() -> None:
-    """Collect garbage rarely and not at exit, to save a sixth of a command's time."""
+    """Run garbage collections rarely, and none at exit. This saves a sixth of a command's time."""
     gc.set_threshold(100_000)
     atexit.register(gc.freeze)
 

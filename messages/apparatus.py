@@ -70,11 +70,12 @@ class CameraTruth(Part):
     )
     right_rotation_offset_rad: SmallTriple = ZERO_3
     rate_hz: Positive | None = Field(
-        default=None, description="true frame rate; null: the scene's frame rate"
+        default=None, description="true frame rate; null: the frame rate in the scene is used"
     )
     read_out_s: NonNegative | None = Field(
         default=None,
-        description="time from the end of exposure to the message; null: the simulator's parameter",
+        description="time from the end of exposure to the message; null: the parameter "
+        "`transfer_s` of the finger simulator is used",
     )
     skew_s: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
         default=0.0,
@@ -107,20 +108,24 @@ class ArmTruth(Part):
     )
     servo_lag_s: Positive | None = Field(
         default=None,
-        description="lag of the arm behind its commands; null: the simulator's parameter",
+        description="lag of the arm behind its commands; null: the parameter `servo_lag_s` of "
+        "the arm simulator is used",
     )
     command_latency_s: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.0, description="time from the arrival of a set-point until it takes effect"
     )
     controller_period_s: Annotated[float, Field(gt=0, le=0.1)] | None = Field(
         default=None,
-        description="period in which set-points take effect; null: the simulator's parameter",
+        description="period in which set-points take effect; null: the parameter `cycle_s` of the "
+        "arm simulator is used, or the fixed cycle of the protocol mxt",
     )
     controller_jitter_s: Annotated[float, Field(ge=0, le=0.05)] = Field(
-        default=0.0, description="standard deviation of the start time of each cycle"
+        default=0.0, description="standard deviation of the start time of each controller cycle"
     )
     backlash_rad: Annotated[float, Field(ge=0, le=0.1)] | None = Field(
-        default=None, description="backlash of each joint's gear; null: the simulator's parameter"
+        default=None,
+        description="backlash of each joint's gear; null: the parameter `backlash_rad` of the "
+        "arm simulator is used",
     )
 
     @classmethod
@@ -152,11 +157,13 @@ class SheetTruth(Part):
         description="length of rubber that slips through the left and right clamp",
     )
     density_kg_per_m3: NonNegative | None = Field(
-        default=None, description="density of the rubber; null: the scene's density; 0: weightless"
+        default=None,
+        description="density of the rubber; null: the density in the scene is used; 0: the "
+        "rubber has no weight",
     )
     friction_coefficient: NonNegative | None = Field(
         default=None,
-        description="friction between finger and sheet; null: the finger does not slip",
+        description="friction coefficient between finger and sheet; null: the finger does not slip",
     )
     hysteresis_ratio: BelowOne = Field(
         default=0.0, description="fraction of the stored energy that is lost in a loading cycle"
@@ -181,7 +188,8 @@ class FingerTruth(Part):
         description="true position of the marker's centre, in the finger's frame",
     )
     marker_shape: Literal["ball", "disc"] = Field(
-        default="ball", description="disc: flat on the nail, seen as an ellipse"
+        default="ball",
+        description="disc: the marker is flat on the nail, so its image is an ellipse",
     )
     marker_tilt_rad: tuple[Finite, Finite] = Field(
         default=(0.0, 0.0),
@@ -189,7 +197,7 @@ class FingerTruth(Part):
     )
     finger_tilt_rad: tuple[Finite, Finite] = Field(
         default=(0.0, 0.0),
-        description="tilt of the finger from its nominal direction, about the world's x and y",
+        description="tilt of the finger from its nominal direction, about the world's x and y axes",
     )
     tremor_frequency_hz: Positive = Field(
         default=10.0, description="centre of the tremor's frequency band"
@@ -199,7 +207,8 @@ class FingerTruth(Part):
     )
     tremor_rms_m: NonNegative | None = Field(
         default=None,
-        description="rms tremor per axis, on paths with tremor; null: the value of the path",
+        description="rms tremor per axis, on paths with tremor; null: the tremor amplitude of "
+        "the path is used",
     )
     voluntary_bandwidth_hz: Annotated[float, Field(ge=0.2, le=20)] = Field(
         default=1.2, description="maximum frequency of the slow random motion of the finger"
@@ -207,11 +216,12 @@ class FingerTruth(Part):
     hand_mass_kg: Positive | None = Field(
         default=None,
         description="mass of the hand at the fingertip, for the finger simulator's parameter "
-        "`hand: coupled`; null: an average hand",
+        "`hand: coupled`; null: the mass of an average hand is used",
     )
     hand_damping_ratio: NonNegative | None = Field(
         default=None,
-        description="damping of the hand divided by its critical damping; null: an average hand",
+        description="damping of the hand divided by its critical damping; null: the value of an "
+        "average hand is used",
     )
     hand_stiffness_n_per_m: NonNegative | None = None
 
@@ -264,7 +274,7 @@ class ProjectorTruth(Part):
     lens: LensTruth = Field(default_factory=LensTruth)
     latency_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = Field(
         default=0.0,
-        description="actual display latency minus 8 ms",
+        description="true display latency minus the nominal display latency of 8 ms",
     )
 
 
@@ -285,7 +295,8 @@ class Apparatus(Message):
     scene: str = Field(description="name of the scene to which the deviations refer")
     scene_id: str | None = Field(
         default=None,
-        description="hash of the scene's object and devices; null: only the name is compared",
+        description="hash of the scene's object and devices; null: only the names of the scenes "
+        "are compared",
     )
     origin: str = Field(default="file", description="origin of the values, as text for users")
     nominal: Devices | None = Field(

@@ -24,8 +24,8 @@ class ArmPoseFit(Part):
     )
     rotation_rad: NonNegative
     rms_px: NonNegative = Field(
-        description="reprojection error of the corners if the board pose follows from the joint "
-        "angles"
+        description="rms reprojection error of the corners, with the board pose computed from "
+        "the joint angles"
     )
 
 
@@ -35,10 +35,11 @@ class ArmBase(Part):
     world_from_base: Pose
     flange_from_board: Pose
     position_std_m: NonNegative = Field(
-        description="position error of this arm at the world's origin, all three axes together"
+        description="standard deviation of this arm's position at the world's origin, all three "
+        "axes together"
     )
     rotation_std_rad: NonNegative = Field(
-        description="orientation error of the base, all three axes together"
+        description="standard deviation of the base's orientation, all three axes together"
     )
     covariance: Covariance = Field(
         description="covariance (6, 6) of the base's error: rotation about its origin, in the "

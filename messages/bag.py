@@ -91,7 +91,11 @@ def split_frames(data: bytes) -> list[memoryview]:
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0
     offset = 8 + 8 * count
     if not count or offset > len(view):
-        raise WireError("malformed", "the recorded message does not begin with its frame lengths")
+        raise WireError(
+            "malformed",
+            "the recorded message does not begin with the lengths of its ZeroMQ frames; the bag is "
+            "damaged or was written by another program",
+        )
     frames = []
     for length in struct.unpack_from(f"<{count}Q", view, 8):
         frames.append(view[offset : offset + length])
@@ -99,7 +103,8 @@ def split_frames(data: bytes) -> list[memoryview]:
     if offset != len(view):
         raise WireError(
             "malformed",
-            f"the recorded message has {len(view)} bytes, but its frame lengths require {offset}",
+            f"the recorded message has {len(view)} bytes, but the lengths of its ZeroMQ frames "
+            f"require {offset} bytes; the bag is damaged",
         )
     return frames
 
@@ -134,7 +139,8 @@ class BagWriter:
             self._file: IO[bytes] = self.path.open("xb")
         except FileExistsError:
             raise BagError(
-                f"{self.path}: the file exists already; a bag cannot be overwritten"
+                f"{self.path}: the file exists already; a bag cannot be overwritten, so choose "
+                "another file name"
             ) from None
         except OSError as error:
             raise BagError(str(make_write_error(self.path, error))) from error
@@ -194,7 +200,7 @@ class BagWriter:
             self._writer.add_attachment(0, 0, name, media_type, data)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a named table of texts that describe the recording."""
+        """Add a named table of strings that describe the recording to the bag."""
         with self._writing():
             self._writer.add_metadata(name, dict(values))
 
@@ -543,7 +549,7 @@ class BagReader:
         magic = file.read(len(MCAP0_MAGIC))
         if magic != MCAP0_MAGIC:
             what = "the file is empty" if not magic else "this is not an MCAP file"
-            raise BagError(f"{self.path}: {what}; give a bag of `flexsheet bag record`")
+            raise BagError(f"{self.path}: {what}; use a bag that `flexsheet bag record` wrote")
         offset = len(MCAP0_MAGIC)
         first = True
         while True:
@@ -556,7 +562,7 @@ class BagReader:
             if first and opcode != Opcode.HEADER:
                 raise BagError(
                     f"{self.path}: its first record is not an MCAP header; "
-                    "give a bag of `flexsheet bag record`"
+                    "use a bag that `flexsheet bag record` wrote"
                 )
             try:
                 self._index_record(file, opcode, offset, length)
@@ -597,14 +603,14 @@ class BagReader:
         ):
             return
         if length > MAX_SUMMARY_RECORD_BYTES:
-            raise ValueError(f"a record states the impossible length of {length} bytes")
+            raise ValueError(f"a record states an implausible length of {length} bytes")
         stream = ReadDataStream(BytesIO(_read_at(file, offset, length)))
         if opcode == Opcode.HEADER:
             profile = mcap_records.Header.read(stream).profile
             if profile != PROFILE:
                 raise BagError(
                     f'{self.path}: the MCAP file has the profile "{profile[:40]}", expected '
-                    '"flexsheet"; give a bag of `flexsheet bag record`'
+                    '"flexsheet"; use a bag that `flexsheet bag record` wrote'
                 )
         elif opcode == Opcode.CHANNEL:
             self._add_channel(mcap_records.Channel.read(stream))
@@ -806,7 +812,8 @@ def recover(
             writer.finish()
     except FileExistsError:
         raise BagError(
-            f"{path_out}: the file exists already; a bag cannot be overwritten, give a new file"
+            f"{path_out}: the file exists already; a bag cannot be overwritten, so choose "
+            "another file name"
         ) from None
     except OSError as error:
         with suppress(OSError):

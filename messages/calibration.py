@@ -31,11 +31,13 @@ class Board(Part):
     rows: Annotated[int, Field(ge=3)]
     square_m: Positive
     marker_m: Positive | None = Field(
-        default=None, description="side length of a marker; ChArUco only"
+        default=None,
+        description="side length of a marker on a ChArUco board; null: the board is a chessboard",
     )
     dictionary: str | None = Field(
         default=None,
-        description="OpenCV's name of the marker dictionary, such as DICT_4X4_50; ChArUco only",
+        description="OpenCV's name of the marker dictionary of a ChArUco board, such as "
+        "DICT_4X4_50",
     )
 
 
@@ -70,12 +72,16 @@ class Uncertainty(Part):
         description="scatter of fits that leave out some pairs, divided by the scatter that the "
         "covariance predicts; if above 1, the covariance was multiplied by the square of this ratio"
     )
-    working_distance_m: Positive = Field(description="depth to which the next two values apply")
+    working_distance_m: Positive = Field(
+        description="depth for which `depth_std_m` and `lateral_std_m` are computed"
+    )
     depth_std_m: NonNegative = Field(
-        description="error of a fingertip along the left camera's optical axis"
+        description="standard deviation of a fingertip's position along the left camera's "
+        "optical axis"
     )
     lateral_std_m: NonNegative = Field(
-        description="error of a fingertip perpendicular to this axis, x and y together"
+        description="standard deviation of a fingertip's position perpendicular to this axis, x "
+        "and y together"
     )
     parameters: tuple[str, ...] = Field(description="names of the covariance's rows and columns")
     covariance: Covariance
@@ -89,7 +95,8 @@ class StereoCalibration(Part):
     date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
     opencv_version: str | None = Field(
-        default=None, description="version of OpenCV; null: computed without OpenCV"
+        default=None,
+        description="version of OpenCV; null: the calibration was computed without OpenCV",
     )
     width_px: Annotated[int, Field(gt=0)]
     height_px: Annotated[int, Field(gt=0)]
@@ -117,7 +124,8 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
     if measured != expected:
         raise CalibrationMismatchError(
             f"the calibration of {calibration.device} is for {measured[0]}x{measured[1]} px, but "
-            f"the scene's camera delivers {expected[0]}x{expected[1]} px: calibrate at this size"
+            f"the scene's camera delivers {expected[0]}x{expected[1]} px: calibrate at "
+            "this image size"
         )
 
 

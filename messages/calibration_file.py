@@ -31,7 +31,7 @@ class CalibrationFileError(FlexsheetError, ValueError):
 
     code = "calibration-file"
     exit_code = 2
-    remedy = "Calibrate again, or give another calibration file."
+    remedy = "Calibrate again, or use another calibration file."
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
@@ -39,7 +39,9 @@ class CalibrationMismatchError(FlexsheetError, ValueError):
 
     code = "calibration-mismatch"
     exit_code = 2
-    remedy = "Give the calibration of the scene's device, or the scene of the calibration."
+    remedy = (
+        "Use the calibration of the device in the scene, or a scene with the calibrated device."
+    )
 
 
 def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:
@@ -110,7 +112,7 @@ def read_calibration(kind: type[Calibration], path: Path, *, command: str) -> Ca
         content = _parse(path)
     except OSError as error:
         raise CalibrationFileError(
-            f"{path}: cannot be read: {error.strerror}; give a file that `{command}` wrote"
+            f"{path}: cannot be read: {error.strerror}; use a file that `{command}` wrote"
         ) from error
     # The parser raises undocumented errors for invalid numbers and dates.
     except (YAMLError, ValueError, RecursionError, TypeError) as error:
@@ -135,5 +137,5 @@ def read_calibration(kind: type[Calibration], path: Path, *, command: str) -> Ca
             for problem in error.errors()[:5]
         )
         raise CalibrationFileError(
-            f"{path}: this is not a calibration of `{command}`: {problems}"
+            f"{path}: this is not a calibration file that `{command}` wrote: {problems}"
         ) from error

@@ -166,7 +166,7 @@ def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
 
 @cache
 def find_max_magnitude(name: str) -> float:
-    """Return the maximum magnitude of a number in a field with the given name."""
+    """Return the largest magnitude that a number in a field of this name may have."""
     if name in MAX_BY_NAME:
         return MAX_BY_NAME[name]
     return next((MAX_BY_UNIT[unit] for unit in MAX_BY_UNIT if name.endswith(unit)), MAX_NUMBER)
@@ -174,7 +174,7 @@ def find_max_magnitude(name: str) -> float:
 
 @cache
 def find_min_positive(name: str) -> float:
-    """Return the minimum value of a positive number in a field with the given name."""
+    """Return the smallest positive number that a field of this name may contain."""
     unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
     return MIN_BY_UNIT.get(unit, MIN_POSITIVE)
 

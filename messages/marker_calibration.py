@@ -35,7 +35,8 @@ class MarkerCalibration(Part):
         default=None,
         min_length=3,
         max_length=3,
-        description="covariance of the position; if not given, the components are uncorrelated",
+        description="covariance of the position; null: the errors of the components are "
+        "uncorrelated",
     )
     point_offset_m: FingerLengths = Field(
         description="mean estimated error of the touched points, world frame"
@@ -52,7 +53,7 @@ def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
     if calibration.scene != scene.name:
         raise CalibrationMismatchError(
             f'scene: the marker was calibrated in the scene "{calibration.scene}", not in '
-            f'"{scene.name}": give the file of this scene, or run `flexsheet calibrate marker`'
+            f'"{scene.name}": use the file of this scene, or run `flexsheet calibrate marker`'
         )
 
 

@@ -179,7 +179,7 @@ class NodeNote(Enum):
     )
     KEY_NOT_PROVED = (
         "did not prove that it has its key",
-        "The other host does not have the secret key of its address.",
+        "The other host lacks the secret key that belongs to its key in the launch file.",
         "The secret key of that host does not match its public key in the launch file, or another "
         "program uses its address. `flexsheet doctor hosts` shows which host it is.",
     )
@@ -219,12 +219,12 @@ class NodeNote(Enum):
     )
     FRAMES_MISSED = (
         "frames missed",
-        "The note counts the images since its start that the simulated camera did not take.",
+        "The note states how many images the simulated camera has missed since its start.",
         "No action is needed unless the number grows steadily. " + BUSY_FIRST,
     )
     FAILED_EXCHANGES = (
         "failed exchanges",
-        "The note counts the commands since the start of the bridge that the arm did not answer.",
+        "The note states how many commands the arm has not answered since the bridge started.",
         "No action is needed unless the number grows steadily. "
         + BUSY_FIRST
         + "Then check the cable and the network of the arm.",
@@ -316,7 +316,7 @@ SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "camera_moved": "the stereo camera is not where the scene says",
     "cameras_misaligned": "one of the two cameras has moved relative to the other",
     "marker_offset": "the finger's marker is not at its assumed position",
-    "servo_lag": "the lag of the arm differs from the configured one",
+    "servo_lag": "the lag of the arm differs from the configured lag",
     "sheet_stiffness": "the sheet is not as stiff as the scene states",
     "arm_not_following": "the arm does not execute the commanded motion",
     "projector_moved": "the projector's pose or lens differs from the scene",
@@ -333,18 +333,18 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "cameras_misaligned": "Fasten both cameras and lenses, and run `flexsheet calibrate stereo`.",
     "marker_offset": "Put the marker back where it was, or calibrate its offset again.",
     "servo_lag": BUSY_FIRST + "An overloaded computer is the usual cause with simulated arms. For "
-    "a real arm, check its payload and its controller's filters. The measured lag is used; "
-    "`servo_lag_s` of the bridge sets the expected one.",
-    "sheet_stiffness": "Set `sheet.young_modulus_pa` of the scene to the calibrated value over the "
-    "thickness, or calibrate the sheet again.",
+    "a real arm, check its payload and its controller's filters. The bridge uses the measured "
+    "lag. Its parameter `servo_lag_s` sets the expected lag.",
+    "sheet_stiffness": "Set `sheet.young_modulus_pa` of the scene to the calibrated stiffness "
+    "(N/m) divided by the thickness, or calibrate the sheet again.",
     "arm_not_following": "Check the arm for a collision, its load, and the backlash of its gears.",
     "projector_moved": "Fasten the projector, and run `flexsheet calibrate projector`.",
     "arm_base_moved": "Check the clamps, and calibrate the bases of the arms again "
     "(docs/set-up-arms.md).",
-    "camera_or_projector_moved": "Set `reference_marks_world_m` of the triangulator to tell them "
-    "apart, or calibrate both again.",
-    "camera_or_arm_base_moved": "Set `reference_marks_world_m` of the triangulator to tell them "
-    "apart, or calibrate both again.",
+    "camera_or_projector_moved": "Set `reference_marks_world_m` of the triangulator to find out "
+    "which has moved, or calibrate both again.",
+    "camera_or_arm_base_moved": "Set `reference_marks_world_m` of the triangulator to find out "
+    "which has moved, or calibrate both again.",
     "display_latency": "Set `display_latency_s` of the renderer to the measured latency.",
 }
 """The remedy for each suspected cause of a deviation from expected values."""

@@ -222,7 +222,10 @@ class Appearance(Part):
     @model_validator(mode="after")
     def _check_image(self) -> Self:
         if self.texture == "image" and (self.image is None or not self.image.size):
-            raise ValueError("texture: image needs an image; give image_file, or another texture")
+            raise ValueError(
+                "texture: the texture `image` requires an image; set image_file, or choose "
+                "another texture"
+            )
         return self
 
 
@@ -233,7 +236,9 @@ class VirtualObject(Part):
     """
 
     geometry: Geometry
-    material: Material | None = Field(default=None, description="null: the object is rigid")
+    material: Material | None = Field(
+        default=None, description="elastic constants of the object; null: the object is rigid"
+    )
     world_from_object: Pose
     support: Support | None = Field(
         default=None,
@@ -513,7 +518,7 @@ class StereoCamera(Part):
     exposure_s: Positive
     gain: Finite | None = Field(
         default=None,
-        description="gain in units of the device; null: the present setting of the device",
+        description="gain in units of the device; null: the present gain of the device is kept",
     )
     read_noise_levels: Positive = Field(
         default=1.5,
@@ -542,8 +547,8 @@ class Projector(Part):
     check_marks_sheet_m: tuple[tuple[Finite, Finite], ...] = Field(
         default=(),
         max_length=8,
-        description="points (x, y) of the sheet, m, onto which bright marks are projected, so that "
-        "the stereo camera checks projector, arms and marker; none: no marks",
+        description="points (x, y) of the sheet, m, onto which bright marks are projected, so "
+        "that the stereo camera checks projector, arms and marker; empty: no marks are projected",
     )
 
 
@@ -637,7 +642,9 @@ class Scene(Message):
     sheet: SheetSpec
     arms: Arms
     camera: StereoCamera
-    projector: Projector | None = Field(default=None, description="null: no image is projected")
+    projector: Projector | None = Field(
+        default=None, description="projector of the images; null: no image is projected"
+    )
     eyes: Eyes
     finger: Finger
     working_range: WorkingRange

@@ -42,7 +42,7 @@ class LeftOutRow(Part):
 
 
 class SheetTable(Part):
-    """A table of the measured force on the finger, divided by the force of the fitted model.
+    """A table of the ratio of the measured force on the finger to the force of the fitted model.
 
     The ratio is interpolated linearly over stretch and position, and by cubics over depth.
     """
@@ -78,11 +78,14 @@ class SheetCalibration(Part):
         "ideal rubber"
     )
     mooney_ratio: Fitted | None = Field(
-        default=None, description="Mooney-Rivlin constants C2/(C1+C2); null: not fitted"
+        default=None,
+        description="ratio C2/(C1+C2) of the Mooney-Rivlin constants; null: the ratio was not "
+        "fitted",
     )
     hysteresis_ratio: Fitted | None = Field(
         default=None,
-        description="fraction of the loading energy that is lost in a cycle; null: not measured",
+        description="fraction of the loading energy that is lost in a cycle; null: the fraction "
+        "was not measured",
     )
     rows: Annotated[int, Field(ge=1)]
     left_out: tuple[LeftOutRow, ...]
@@ -109,7 +112,7 @@ def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
         if abs(measured - expected) > NOMINAL_RATIO * expected:
             raise CalibrationMismatchError(
                 f"the calibrated sheet has {key} {measured:g}, but the scene's sheet.{key} is "
-                f"{expected:g}: give the file of this sheet, or calibrate this sheet"
+                f"{expected:g}: use the file of this sheet, or calibrate this sheet"
             )
 
 

@@ -172,7 +172,9 @@ class SheetTarget(Message):
     """
 
     phase: Phase
-    reason: SheetReason = Field(description='why the sheet stops or waits; otherwise "ok"')
+    reason: SheetReason = Field(
+        description='reason why the sheet stops or waits; "ok" if it does neither'
+    )
     valid_at_ns: Stamp = Field(
         description="time of this pose, on the clock of the header's timestamps"
     )
@@ -185,7 +187,8 @@ class SheetTarget(Message):
     )
     trajectory: SheetTrajectory | None = Field(
         default=None,
-        description="motion after valid_at_ns; None: both arms extrapolate with the velocity",
+        description="motion of the sheet after `valid_at_ns`; None: both arms extrapolate the "
+        "pose with the velocity",
     )
     contact_world_m: Vector3 = Field(description="contact point on the undeformed object")
     normal_world: Vector3
@@ -225,32 +228,37 @@ class ArmState(Message):
         description="true: an e-stop is latched, and the arm does not move at all",
     )
     reason: str = Field(
-        default="", description="why the arm does not follow the target; empty if it does"
+        default="",
+        description="reason why the arm does not follow the target; empty if the arm follows it",
     )
     path_blocked: bool = Field(
         default=False,
-        description="true: the arm rests because every path to the target is blocked; reason gives "
-        "the cause",
+        description="true: the arm rests because every path to the target is blocked; `reason` "
+        "contains the cause",
     )
     auto_arming: bool = Field(
-        default=False, description="true: the arm arms itself without a command of the operator"
+        default=False,
+        description="true: the arm is armed automatically, without a command of the operator",
     )
     joints_rad: Vector6
     joints_commanded_rad: Vector6
     world_from_flange: Transform
     world_from_flange_commanded: Transform
     command_age_s: NonNegative | None = Field(
-        description="age of the sheet target that the arm follows, s; None: no target"
+        description="age of the sheet target that the arm follows, s; None: there is no target"
     )
     target_source_ns: Stamp = Field(
-        description="exposure of the image from which this sheet target was computed; 0: none"
+        description="time of the camera exposure from which this sheet target was computed; 0: "
+        "there is no target"
     )
     trajectory_ends_ns: Stamp = Field(
         default=0,
-        description="end of the target's trajectory that the arm may follow; 0: the arm follows no "
-        "trajectory",
+        description="time until which the arm may follow the target's trajectory; 0: the arm "
+        "follows no trajectory",
     )
-    command_sent_ns: Stamp = Field(description="time of the newest command to the arm; 0: none")
+    command_sent_ns: Stamp = Field(
+        description="time of the newest command to the arm; 0: no command was sent"
+    )
     edge_distance_m: NonNegative | None = Field(
         description="distance between both clamped edges of the sheet; None: unknown"
     )
@@ -273,8 +281,8 @@ class ArmLatency(Message):
 
     side: Side
     latency_s: Finite = Field(
-        description="time from the exposure until the first command that follows from it, plus the "
-        "arm's measured lag"
+        description="time from a camera exposure until the first command for the resulting sheet "
+        "target, plus the arm's measured lag"
     )
 
 
@@ -312,8 +320,8 @@ class SoftBody(Message):
     )
     force_error_ratio: NonNegative = Field(
         default=0.0,
-        description="relative error of the force at `push_depth_m`, as stated by the method; the "
-        "larger error while one method replaces another; 0: unknown",
+        description="relative error of the force at `push_depth_m`, as stated by the method; "
+        "while one method replaces another, the larger of both errors; 0: the error is unknown",
     )
     in_transition: bool = Field(
         default=False,
@@ -372,7 +380,7 @@ class Eye(Message):
 
 
 class Display(Message):
-    """The display settings of the renderer, which the console or an experiment publishes."""
+    """The display settings of the renderer, published by the console or by an experiment."""
 
     correction: Correction
     stereo: StereoMode
@@ -384,9 +392,14 @@ class Display(Message):
         "field every 20 mm; coordinate_ramp_x, coordinate_ramp_y: the object, coloured by its "
         "position on the imaginary screen",
     )
-    marks: bool = Field(default=True, description="draw marks at the target and at the fingertip")
+    marks: bool = Field(
+        default=True,
+        description="true: marks are drawn at the target's contact point and at the fingertip",
+    )
     pixels_every: int = Field(
-        default=0, ge=0, description="attach pixels to each nth frame; 0: none"
+        default=0,
+        ge=0,
+        description="number n: each nth frame contains its pixels; 0: no frame contains pixels",
     )
     label: str = Field(
         default="", description="label that is copied to each frame drawn with these settings"
@@ -412,7 +425,9 @@ class Frame(Message):
     )
     draw_s: NonNegative
     late_frames: int = Field(
-        ge=0, description="frames that were displayed more than half a period later than predicted"
+        ge=0,
+        description="number of frames that were displayed more than half a period later than "
+        "predicted",
     )
     eye: Literal["both", "left", "right"] = Field(
         default="both",
@@ -422,11 +437,13 @@ class Frame(Message):
         default=0, description="time when the graphics card had finished the frame"
     )
     swapped_ns: Stamp = Field(
-        default=0, description="time when the window showed the frame; 0: no window"
+        default=0,
+        description="time when the window showed the frame; 0: the renderer has no window",
     )
     light_ns: Stamp = Field(
         default=0,
-        description="midpoint of the frame's display, measured; assumed if there is no window",
+        description="measured time of the middle of the frame's display; assumed if the renderer "
+        "has no window",
     )
     shaped_for_ns: Stamp = Field(
         default=0,
@@ -434,7 +451,7 @@ class Frame(Message):
     )
     fingertip_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
         default_factory=lambda: np.zeros((0, 3)),
-        description="predicted fingertip position at `predicted_to_ns`, m; no row: unknown",
+        description="predicted fingertip position at `predicted_to_ns`, m; no row if it is unknown",
     )
     occluded_fraction: NonNegative = Field(
         default=0.0,
@@ -454,14 +471,15 @@ class Frame(Message):
         "by the displacement of the fingertip; 0 if there is no contact",
     )
     pixels: tuple[ColorImage, ...] = Field(
-        description="projector images, top row first: none, or one (mono or packed stereo)"
+        description="projector image (mono or packed stereo), top row first; empty if the "
+        "message has no image"
     )
 
 
 class EStop(Message):
-    """A software emergency stop of the arms, which remains active until it is reset.
+    """A command that engages (`engaged` is true) or resets the software e-stop of both arms.
 
-    The message engages the stop if `engaged` is true, and resets it if `engaged` is false.
+    An engaged e-stop remains active until it is reset.
     """
 
     engaged: bool
@@ -504,12 +522,17 @@ class PortStatus(MessagePart):
     )
     messages: int = Field(ge=0)
     dropped: int = Field(
-        ge=0, description="messages superseded, or lost by an overflow, before the node read them"
+        ge=0,
+        description="number of messages that were replaced by newer messages, or lost by an "
+        "overflow, before the node read them",
     )
     gaps: int = Field(
-        ge=0, description="messages lost in transport, according to their sequence numbers"
+        ge=0,
+        description="number of messages lost in transport, according to their sequence numbers",
     )
-    rejected: int = Field(ge=0, description="messages that are malformed or of another type")
+    rejected: int = Field(
+        ge=0, description="number of messages that are malformed or of another type"
+    )
 
 
 class ClockEcho(MessagePart):
@@ -597,7 +620,7 @@ class SelfCheck(MessagePart):
 
 
 class Status(Message):
-    """The state of a node, which each node publishes once per second."""
+    """The state of a node. Each node publishes its state once per second."""
 
     node: str
     state: Literal["starting", "running", "degraded", "stopping"]
@@ -645,7 +668,7 @@ class NodeProcess(MessagePart):
         description="exited: the process has ended; it is restarted if that is allowed"
     )
     restarts: int = Field(ge=0)
-    hangs: int = Field(ge=0, description="restarts because of a missing heartbeat")
+    hangs: int = Field(ge=0, description="number of restarts because of a missing heartbeat")
 
 
 class NodeOmission(MessagePart):
@@ -679,19 +702,20 @@ class CpuPressure(MessagePart):
     included.
     """
 
-    busy: bool = Field(description="`wait_ratio` is above a quarter")
+    busy: bool = Field(description="true: `wait_ratio` is above 0.25")
     wait_ratio: NonNegative = Field(
         description="longest waiting time of a node divided by the elapsed time"
     )
     node: str = Field(description="node with this waiting time")
     programs: tuple[ProgramCpu, ...] = Field(
         default=(),
-        description="programs that use most processor time, in descending order; only if `busy`",
+        description="programs that use the most processor time, in descending order; empty if "
+        "`busy` is false",
     )
 
 
 class HostStatus(Message):
-    """The state of a computer, which its launcher publishes once per second."""
+    """The state of a computer. The launcher on the computer publishes it once per second."""
 
     host: str
     run: str = Field(description="identifier of the run")
@@ -702,7 +726,11 @@ class HostStatus(Message):
     load_ratio: NonNegative = Field(
         description="load average of the last minute divided by the number of cores"
     )
-    disk_free_bytes: int = Field(ge=0, description="free space for bags, or in the working folder")
+    disk_free_bytes: int = Field(
+        ge=0,
+        description="free space on the disk of the recorder's folder; on a host without a "
+        "recorder, on the disk of the working folder",
+    )
     memory_free_bytes: int = Field(ge=0)
     nodes: tuple[NodeProcess, ...]
     omitted: tuple[NodeOmission, ...] = Field(
@@ -717,14 +745,18 @@ class HostStatus(Message):
     keys: tuple[HostKey, ...] = Field(
         default=(), description="keys of the hosts that this host accepts"
     )
-    estop: str | None = Field(default=None, description="reason of the latched e-stop; None: none")
+    estop: str | None = Field(
+        default=None, description="reason of the latched e-stop; None: no e-stop is latched"
+    )
     cpu: CpuPressure | None = Field(
-        default=None, description="None: the system does not measure it, or no node runs yet"
+        default=None,
+        description="waiting times for a processor; None: the system does not measure them, or "
+        "no node runs yet",
     )
     nice_denied: bool = Field(
         default=False,
-        description="true: the user may not set a `nice` of the launch file, so that nodes run "
-        "without their priority",
+        description="true: the user is not permitted to set a `nice` value of the launch file, "
+        "so nodes run without their priority",
     )
 
 
@@ -732,7 +764,7 @@ PathJoin = Literal["rounded_lines", "spline"]
 
 
 class FingerPath(Message):
-    """A path for the simulated finger, which first moves smoothly to the path's first point."""
+    """A path of the simulated finger. The finger first moves smoothly to the first point."""
 
     label: str
     times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
@@ -761,7 +793,10 @@ class TwinFinger(Message):
     path_time_s: Finite = Field(
         description="time since the start of the path; negative before the first point"
     )
-    path_stroke_s: Positive | None = Field(default=None, description="`stroke_s` of the path")
+    path_stroke_s: Positive | None = Field(
+        default=None,
+        description="duration of the motion, if the finger path is a stroke of an experiment",
+    )
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
     force_world_n: Vector3 = Field(

@@ -293,7 +293,7 @@ def _unpack(frames: Sequence[Any]) -> Any:
         return np.frombuffer(view, dtype).reshape(shape)
 
     if not frames:
-        raise WireError("frames", "the message has no frames")
+        raise WireError("frames", "the message has no ZeroMQ frames")
     try:
         # msgpack reads the buffer of a zmq.Frame, but not the frame itself.
         first = frames[0] if isinstance(frames[0], _BUFFERS) else frames[0].buffer
@@ -315,7 +315,8 @@ def _unpack(frames: Sequence[Any]) -> Any:
         raise WireError("malformed", f"this is not a flexsheet message: {reason}") from error
     if used != len(frames) - 1:
         raise WireError(
-            "frames", f"the message has {len(frames)} frames, but its header describes {used + 1}"
+            "frames",
+            f"the message has {len(frames)} ZeroMQ frames, but its header describes {used + 1}",
         )
     return unpacked
 

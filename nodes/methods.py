@@ -26,7 +26,7 @@ NORMAL_95 = 1.96
 
 Progress = Callable[[int, int], None]
 Case = dict[str, float | int | str]
-"""The conditions of a measurement by name, for instance {"depth_mm": 10}."""
+"""The conditions of a benchmark measurement by name, for instance {"depth_mm": 10}."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class Point:
     error_range: tuple[float, float] | None = None
 
     def costs(self) -> tuple[Interval, Interval]:
-        """Return the median time and the error, with their confidence intervals."""
+        """Return the method's costs: median time and error, with their confidence intervals."""
         return (
             Interval(self.median_s, *(self.median_range_s or (self.median_s, self.median_s))),
             Interval(self.error, *(self.error_range or (self.error, self.error))),
@@ -183,9 +183,10 @@ def clip_range(end: float, values: Sequence[float]) -> tuple[float, ...]:
 
 
 def pareto_front(points: Sequence[Point]) -> list[str]:
-    """Return the methods on the Pareto front of at least one benchmark case in their valid range.
+    """Return the methods that are on the Pareto front of at least one benchmark case.
 
-    The methods are sorted by the maximum of their median times over these cases.
+    Only results within the valid range of their method are compared. The methods are sorted by the
+    maximum of their median times over the cases.
     """
     usable = [point for point in points if point.in_range]
     front = {

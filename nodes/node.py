@@ -218,7 +218,7 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """A method that is called periodically.
+    """A periodic method of a node class.
 
     rate_parameter: name of the node parameter that contains the rate (Hz).
     """

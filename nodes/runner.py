@@ -457,7 +457,10 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
 
 
 def _prioritize(config: ProcessConfig) -> None:
-    """Set the real-time priority after the start, so that the start delays no other program."""
+    """Give this process the configured real-time priority when all nodes are ready.
+
+    Before that, the priority would let the start of the process delay other programs.
+    """
     if config.realtime_priority is not None:
         asyncio.get_running_loop().set_default_executor(
             ThreadPoolExecutor(thread_name_prefix="asyncio", initializer=leave_real_time)

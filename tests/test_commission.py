@@ -410,7 +410,7 @@ def test_the_report_names_residuals_limits_and_advice(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("prepare", "words"),
     [
-        (lambda folder: open_lab(folder, "seed:4").write(), "belongs to seed:4, .* gives seed:3"),
+        (lambda folder: open_lab(folder, "seed:4").write(), "uses seed:4, .* names seed:3"),
         (lambda folder: (folder / "notes.txt").write_text("x"), "not empty and has no commission"),
         (
             lambda folder: (folder / "commission.json").write_text("{]"),
@@ -591,7 +591,7 @@ def test_a_failed_stroke_says_that_finished_steps_are_kept(
 ) -> None:
     lab, devices = open_laboratory(tmp_path / "lab", DEMO, None, "seed:3")
     errors = [
-        ExperimentError("the bag contains 0 valid fingertips"),
+        ExperimentError("the bag contains 0 valid fingertip measurements"),
         ExperimentInterruptedError("interrupted; all nodes are stopped"),
     ]
 
@@ -860,7 +860,7 @@ def test_a_robustness_trial_commissions_its_laboratory(
 def test_commissioned_and_calibrated_exclude_each_other() -> None:
     line = "experiment robustness --seeds 0 --commissioned --calibrated --json"
     done = CliRunner().invoke(cli.app, line.split())
-    assert "give one of the two" in str(done.exception)
+    assert "use only one" in str(done.exception)
 
 
 @pytest.mark.long

@@ -590,7 +590,7 @@ def test_a_finger_that_is_none_is_held(
                 "triangles": np.zeros((0, 3), dtype=np.int64),
                 "smoothing_m": 0.003,
             },
-            "cannot bound a solid",
+            "a closed surface needs at least 4",
         ),
     ],
 )

@@ -166,7 +166,7 @@ def test_repairs_are_made_and_reported(tmp_path: Path) -> None:
         (
             trimesh.Trimesh([[0, 0, 0], [30, 0, 0], [0, 30, 0]], [[0, 1, 2]], process=False),
             0.001,
-            "cannot bound a solid",
+            "a closed surface needs at least 4",
         ),
     ],
     ids=["hole", "large", "small", "cut", "single"],

@@ -268,7 +268,7 @@ class ViewState:
 
 
 def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
-    """Yield each image in a message with the name of its channel."""
+    """Yield each image in a message, together with the name of the channel for the image."""
     match message:
         case StereoPair():
             yield f"{topic}/left", message.left

@@ -222,7 +222,7 @@ def _make_conversion(annotation: Any) -> Get:
 
 
 def _applied(get: Get, function: Callable[[Any], Any]) -> Get:
-    """Return a function that returns `function(get(row))`, or None if `get(row)` is None."""
+    """Return a getter that applies `function` to the result of `get`, unless it is None."""
 
     def apply(row: Any) -> Any:
         value = get(row)

@@ -63,7 +63,7 @@ def select_topics(
     for name in wanted:
         if name not in chosen:
             why = left_out.get(name, "it is not in the bag")
-            raise BagError(f'topic "{name}" cannot be played: {why}; leave it out')
+            raise BagError(f'topic "{name}" cannot be played: {why}; omit this topic')
     return TopicSelection(tuple(chosen), left_out)
 
 

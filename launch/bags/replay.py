@@ -75,7 +75,7 @@ class ReplayResult:
     last_error: str = ""
 
     def digest(self) -> str:
-        """Return the SHA-256 of all messages that the node published, in hexadecimal digits."""
+        """Return the SHA-256 hash of all messages that the node published, as hexadecimal text."""
         digest = hashlib.sha256()
         for one in self.sent:
             digest.update(one.topic.encode())
@@ -128,12 +128,12 @@ class Verification:
 
     @property
     def repeatable(self) -> bool:
-        """Return whether both replays ran without errors and gave the same bytes."""
+        """Return whether the node published identical bytes in both replays, without errors."""
         return self.same_bytes and self.errors == 0
 
     @property
     def as_live(self) -> bool:
-        """Return whether the outputs are as in the live run, within the tolerance."""
+        """Return whether the replayed outputs equal the recorded outputs within the tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()

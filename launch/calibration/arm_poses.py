@@ -250,7 +250,7 @@ class PoseRecorder:
         self._poses: list[Floats] = []
 
     def update_joints(self, joints_rad: Floats, time_s: float) -> None:
-        """Add joint angles (6,), in rad, that were measured at `time_s`."""
+        """Detect motion of the arm from joint angles (6,), in rad, measured at `time_s`."""
         moved = self._joints is None or np.abs(joints_rad - self._joints).max() > MAX_STILL_RAD
         if moved:
             self._joints, self._still_since_s = joints_rad, time_s

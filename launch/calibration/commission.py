@@ -216,8 +216,9 @@ class Commissioning:
             before, now = getattr(self.state, key), getattr(given, key)
             if before != now:
                 raise CommissionError(
-                    f"{self.folder / STATE_FILE}: {key}: the folder belongs to {before}, but "
-                    f"the command gives {now}; give the same file or value, or a new folder"
+                    f"{self.folder / STATE_FILE}: {key}: the commissioning in this folder uses "
+                    f"{before}, but the command names {now}; name the same file or value, or a new "
+                    "folder"
                 )
 
     def _load_state(self) -> State | None:
@@ -566,7 +567,7 @@ def list_doubts(
 
 
 def _describe_effects(figures: Mapping[str, Any]) -> str:
-    """Return the latency and the lost messages of the stroke in parentheses, or an empty text."""
+    """Return a text in parentheses with the latency and the lost messages of the stroke, or ""."""
     stroke = figures.get("stroke", {})
     effects = []
     latency_ms = stroke.get("latency_ms", {}).get("exposure_to_frame", {}).get("p50")
@@ -624,7 +625,7 @@ def _describe_nearest_metric(figures: Mapping[str, Any]) -> str | None:
 
 
 def _rank_uncertainties(state: State) -> list[str]:
-    """Return a text for each uncertainty that a step states in mm, with the largest first."""
+    """Return a text for each uncertainty (mm) in the steps' results, with the largest first."""
     found = [
         (value, f"{name}: {key.removesuffix('_mm').replace('_', ' ')} {value:.2f} mm")
         for name, record in state.steps.items()

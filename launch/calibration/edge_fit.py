@@ -195,11 +195,11 @@ class _ArmModel:
         self.measured = np.array([row.position_world_m for row in rows])
 
     def transforms(self, unknowns: Floats) -> tuple[Floats, Floats]:
-        """Return world_from_base (4, 4) and flange_from_edge (4, 4) for given unknowns (19,)."""
+        """Return world_from_base and flange_from_edge (4, 4) for values (19,) of the unknowns."""
         return apply_motion(self._base, unknowns[BASE]), apply_motion(self._clamp, unknowns[EDGE])
 
     def positions(self, unknowns: Floats) -> Floats:
-        """Return the world positions (n, 3), in m, of the n marks for given unknowns (19,)."""
+        """Return the world positions (n, 3), m, of the n marks for values (19,) of the unknowns."""
         base, clamp = self.transforms(unknowns)
         found = [
             apply(

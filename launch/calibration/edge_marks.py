@@ -159,7 +159,7 @@ class EdgeMarkRecorder:
             csv.writer(file).writerow(COLUMNS)
 
     def update_joints(self, side: Side, joints_rad: Floats, time_s: float) -> None:
-        """Add joint angles (6,), in rad, of one arm that were measured at `time_s`."""
+        """Detect motion of one arm from its joint angles (6,), in rad, measured at `time_s`."""
         before = self._joints.get(side)
         if before is None or np.abs(joints_rad - before).max() > MAX_STILL_RAD:
             self._joints[side], self._still_since_s = joints_rad, time_s

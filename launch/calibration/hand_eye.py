@@ -530,7 +530,7 @@ def _compute_discrepancies(
 
 
 def _find_rough_inliers(discrepancies: Floats) -> Bools:
-    """Return a mask (n,) that is true for each of the n poses that is used in the first fit.
+    """Return a mask (n,) of the poses that are used in the first fit.
 
     A pose is excluded if its error exceeds a multiple of the median error.
 

@@ -116,7 +116,7 @@ class MarkerFit:
 
     @property
     def residual_rms_m(self) -> float:
-        """Return the root mean square (m) of `residuals_m`."""
+        """Return the root mean square (m) of the residuals of all touches."""
         return float(np.sqrt(np.mean(self.residuals_m**2)))
 
 

@@ -113,7 +113,9 @@ class PredictedError(LimitedModel):
     typical: float
     limit_95: float
     tolerance: float
-    within: bool = Field(description="whether the 95 % quantile is within the tolerance")
+    within: bool = Field(
+        description="whether the 95 % quantile of the error is within the tolerance"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,7 +153,7 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> Flo
 
 
 def project_points(projector: Projector, world: Floats) -> Floats:
-    """Return the projector pixels (n, 2) that light world points (n, 3), in m."""
+    """Return the projector pixels (n, 2) that illuminate the world points (n, 3), in m."""
     lens, pose = projector.lens, projector.world_from_projector
     local = apply(inverse(pose_matrix(pose)), world)
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)

@@ -187,7 +187,7 @@ class PairSelection:
             del self.good[i]
 
     def pairs(self) -> list[BoardPair]:
-        """Return the used pairs. Raises CalibrationError if fewer than MIN_PAIRS pairs are used."""
+        """Return the usable image pairs. Raises CalibrationError if fewer than MIN_PAIRS exist."""
         if len(self.good) < MIN_PAIRS:
             listed = "".join(f"\n  {self._names[i]}: {text}" for i, text in self.reasons.items())
             raise CalibrationError(

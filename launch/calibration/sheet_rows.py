@@ -74,7 +74,9 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
     problems = list_missing(where, names, REQUIRED)
     if sum(name in names for name in STRETCH) != 1:
         problems.append(
-            Problem(where, (), f"expected one of the columns {' and '.join(STRETCH)}", "give one")
+            Problem(
+                where, (), f"expected one of the columns {' and '.join(STRETCH)}", "use exactly one"
+            )
         )
     return problems
 
@@ -94,7 +96,12 @@ def _parse_row(
             value = float(text)
         except ValueError:
             problems.append(
-                Problem(where, (name,), f'expected a number, found "{text}"', "for example 12.5")
+                Problem(
+                    where,
+                    (name,),
+                    f'expected a number, found "{text}"',
+                    "write a number, such as 12.5",
+                )
             )
             continue
         if name == "unloading":
@@ -102,7 +109,12 @@ def _parse_row(
                 values[name] = value
             else:
                 problems.append(
-                    Problem(where, (name,), f"expected 0 or 1, found {text}", "1: unloading")
+                    Problem(
+                        where,
+                        (name,),
+                        f"expected 0 or 1, found {text}",
+                        "write 1 for unloading, or 0 for loading",
+                    )
                 )
             continue
         signed = name in ("x_mm", "y_mm", "force_n", "edge_force_n")
@@ -118,7 +130,10 @@ def _parse_row(
         elif name == "stretch_ratio" and not 0.8 < value < 3.0:
             problems.append(
                 Problem(
-                    where, (name,), f"expected a ratio near 1, found {text}", "for example 1.05"
+                    where,
+                    (name,),
+                    f"expected a ratio near 1, found {text}",
+                    "write a ratio, such as 1.05",
                 )
             )
         else:

@@ -38,7 +38,9 @@ TOPICS = ("arm_left", "arm_right")
 CONFIRMATION_TIMEOUT_S = 3.0
 MAX_STATE_AGE_S, POLL_PERIOD_S = 0.5, 0.02
 
-ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, which is shown and logged.")]
+ReasonOption = Annotated[
+    str, typer.Option("--reason", help="Reason for the command; it is shown and logged.")
+]
 
 
 @app.command(epilog=examples("flexsheet arms status", "flexsheet arms status --json"))
@@ -168,7 +170,7 @@ def reset(
 
 
 def _describe_reset(plan: ResolvedGraph) -> str:
-    """Describe the condition under which each arm moves after a reset."""
+    """Describe for each arm under which condition it moves after a reset of the e-stop."""
     from flexsheet.launch.plans.plan_model import ArmingMode
 
     arming = {

@@ -300,7 +300,8 @@ def verify(
     node: Annotated[
         str,
         typer.Argument(
-            help="Node name in the bag's launch file.", autocompletion=complete.node_types
+            help="Name of a node of the graph that was recorded.",
+            autocompletion=complete.node_types,
         ),
     ],
     tolerance: Annotated[
@@ -345,7 +346,8 @@ def verify(
 def report(
     bag: options.BagArgument,
     output: Annotated[
-        Path | None, options.output_file("HTML file to write; default: next to the bag.")
+        Path | None,
+        options.output_file("HTML file to write; default: bag path with the suffix .html."),
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -386,7 +388,9 @@ def plot(
     ],
     output: Annotated[
         Path | None,
-        options.output_file("Image file to write (.svg, .png); default: next to the bag."),
+        options.output_file(
+            "Image file to write (.svg, .png); default: bag path with the suffix .svg."
+        ),
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:

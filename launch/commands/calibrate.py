@@ -63,7 +63,9 @@ SquareOption = Annotated[
 MarkerOption = Annotated[
     float | None,
     typer.Option(
-        metavar="MM", help="Side length of a ChArUco marker, mm; default: a chessboard.", min=1e-3
+        metavar="MM",
+        help="Side length of a ChArUco marker, mm; default: the board is a chessboard.",
+        min=1e-3,
     ),
 ]
 DictionaryOption = Annotated[str, typer.Option(help="OpenCV dictionary of the ChArUco markers.")]
@@ -73,7 +75,7 @@ CalibrationOption = Annotated[
     typer.Option(
         "--calibration",
         metavar="FILE",
-        help="Stereo calibration file; default: the camera of the scene.",
+        help="Stereo calibration file; default: the camera parameters of the scene are used.",
     ),
 ]
 

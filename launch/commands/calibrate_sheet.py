@@ -63,7 +63,7 @@ def sheet(
         Path | None,
         typer.Option(
             metavar="SCENE",
-            help="Scene file; its sheet is pushed in simulation instead of measured.",
+            help="Simulate the pushes with the sheet of this scene file.",
         ),
     ] = None,
     places: Annotated[

@@ -43,7 +43,8 @@ def chart(
     family: Annotated[
         str | None,
         typer.Argument(
-            help="Method family to measure; default: all. system: whole configurations of a graph.",
+            help="Method family to measure; default: all families. The name system selects whole "
+            "configurations of a graph instead.",
             autocompletion=complete.families,
         ),
     ] = None,
@@ -52,8 +53,8 @@ def chart(
         typer.Option(
             "--scene",
             metavar="SCENE",
-            help="Scene to measure in; default: cylinder. For system: repeat the option; default: "
-            "all shipped scenes.",
+            help="Scene to measure in; default: cylinder. For system, repeat the option for "
+            "several scenes; the default is all shipped scenes.",
             autocompletion=complete.scenes,
         ),
     ] = None,
@@ -62,7 +63,7 @@ def chart(
     ),
     redraw: Annotated[
         bool,
-        typer.Option("--redraw", help="Draw the results stored in --output again; do not measure."),
+        typer.Option("--redraw", help="Draw the results in --output again, without measuring."),
     ] = False,
     cases: Annotated[
         bool,

@@ -146,7 +146,7 @@ def commission(
         )
     if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
         raise CommandError(
-            "--check repeats only the verification; remove --step, --skip and other --data"
+            "--check repeats only the verification; remove --step, --skip and --data of other steps"
         )
     lab, devices = open_laboratory(
         output,

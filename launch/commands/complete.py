@@ -32,7 +32,7 @@ node_types = _keys_of("flexsheet.nodes", "NODES")
 
 
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the matching host names of the launch file that the command line contains."""
+    """Return the hosts of the launch file on the command line that match the typed text."""
     from flexsheet.launch.plans.documents import BadInputError
     from flexsheet.launch.plans.plan import load_graph
 
@@ -45,28 +45,28 @@ def hosts(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def tuned_families(incomplete: str) -> list[str]:
-    """Return the matching method families of `flexsheet tune`."""
+    """Return the method families of `flexsheet tune` that match the typed text."""
     from flexsheet.launch.methods.tune import TUNABLES
 
     return _filter((one.name for one in TUNABLES), incomplete)
 
 
 def gestures(incomplete: str) -> list[str]:
-    """Return the matching gesture names, or paths of CSV files if no name matches."""
+    """Return the gestures that match the typed text, or matching CSV files if there are none."""
     from flexsheet.launch.experiments.gestures import GESTURES
 
     return _filter(GESTURES, incomplete) or files(".csv")(incomplete)
 
 
 def runs(incomplete: str) -> list[str]:
-    """Return the matching run directories of running graphs."""
+    """Return the run directories of running graphs that match the typed text."""
     from flexsheet.launch.running.runs import list_live_runs
 
     return _filter((str(run.directory) for run in list_live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:
-    """Return the matching method families of `flexsheet chart`."""
+    """Return the method families of `flexsheet chart` that match the typed text."""
     from flexsheet.launch.methods.charts import FAMILIES
 
     return _filter([*FAMILIES, "system"], incomplete)
@@ -95,23 +95,23 @@ yaml_files = files(".yaml", ".yml")
 
 
 def launch_files(incomplete: str) -> list[str]:
-    """Return the matching names of shipped launch files and paths of YAML files."""
+    """Return the shipped launch files and the paths of YAML files that match the typed text."""
     return _filter(list_shipped(LAUNCH_FILES), incomplete) + yaml_files(incomplete)
 
 
 def scenes(incomplete: str) -> list[str]:
-    """Return the matching names of shipped scenes and paths of YAML files."""
+    """Return the shipped scenes and the paths of YAML files that match the typed text."""
     return _filter(list_shipped(SCENES), incomplete) + yaml_files(incomplete)
 
 
 def nodes(incomplete: str) -> list[str]:
-    """Return the matching names of running nodes and of node types."""
+    """Return the names of running nodes and of node types that match the typed text."""
     running = [node.name for node in _running_nodes()]
     return list(dict.fromkeys([*_filter(running, incomplete), *node_types(incomplete)]))
 
 
 def node_parameters(incomplete: str) -> list[str]:
-    """Return the matching parameters of the running graph, as NODE.PARAMETER."""
+    """Return the parameters (NODE.PARAMETER) of the running graph that match the typed text."""
     found = (f"{node.name}.{name}" for node in _running_nodes() for name in node.parameters)
     return _filter(found, incomplete)
 

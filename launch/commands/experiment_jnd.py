@@ -52,8 +52,8 @@ def jnd(
         typer.Option(
             metavar="PA",
             min=1.0,
-            help="Young's modulus of the reference object, Pa; default: half the scene's. The "
-            "other objects have up to twice this modulus.",
+            help="Young's modulus of the reference object, Pa; default: half of the value in "
+            "the scene. The other objects have up to twice this modulus.",
         ),
     ] = None,
     simulated: Annotated[

@@ -41,7 +41,7 @@ def robustness(
         str,
         typer.Option(
             metavar="A-B",
-            help="Range of random seeds; each seed sets the errors of one simulated hardware. "
+            help="Range of random seeds; each seed sets the errors of one simulated apparatus. "
             "Seeds 0-99 are for development, higher seeds for reports.",
         ),
     ],
@@ -51,7 +51,7 @@ def robustness(
         bool,
         typer.Option(
             "--commissioned",
-            help="Calibrate each simulated hardware first, as `flexsheet commission` does, and "
+            help="Calibrate each simulated apparatus first, as `flexsheet commission` does, and "
             "evaluate it in simulated time.",
         ),
     ] = False,
@@ -59,7 +59,8 @@ def robustness(
     workers: options.WorkersOption = 1,
     scheduler: options.SchedulerOption = None,
     keep_bags: Annotated[
-        bool, typer.Option("--keep-bags", help="Keep the recording of each trial in the folder.")
+        bool,
+        typer.Option("--keep-bags", help="Keep the recording of each trial in the output folder."),
     ] = False,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,

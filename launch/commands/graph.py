@@ -49,7 +49,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
         live = list_live_runs()
         ready = [run for run in live if run.plan_file.is_file()]
         if live and not ready:
-            raise NoGraphError("the graph is starting; repeat the command in some seconds")
+            raise NoGraphError("the graph is starting; repeat the command in a few seconds")
         if not ready:
             raise NoGraphError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]

@@ -24,7 +24,7 @@ app = make_app("Manage the key pairs by which hosts authenticate each other.")
 
 
 class KeyCommand(TyperCommand):
-    """A command whose last argument can be a key that starts with "-"."""
+    """A command whose last argument can be a public key that starts with "-"."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert "--" before a key that starts with "-", so that it is not parsed as an option."""

@@ -51,7 +51,12 @@ def ros2_bridge(
     ] = 1.0,
     domain: Annotated[
         int | None,
-        typer.Option(min=0, max=232, help="DDS domain number; default: ROS_DOMAIN_ID or 0."),
+        typer.Option(
+            min=0,
+            max=232,
+            help="DDS domain number; default: value of the environment variable ROS_DOMAIN_ID, or "
+            "0 if it is not set.",
+        ),
     ] = None,
     interface: Annotated[
         str,

@@ -50,7 +50,9 @@ POLL_PERIOD_S = 0.05
 
 NodeArgument = Annotated[
     str,
-    typer.Argument(metavar="NODE", help="Node of the graph.", autocompletion=complete.nodes),
+    typer.Argument(
+        metavar="NODE", help="Name of a node of the graph.", autocompletion=complete.nodes
+    ),
 ]
 
 
@@ -148,7 +150,7 @@ def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
 
 
 def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return an explanation of each count that is not zero in the table of `flexsheet status`."""
+    """Return an explanation of each nonzero message count in the table of `flexsheet status`."""
     lines = []
     if any(row["skipped"] for row in rows):
         lines.append(
@@ -282,7 +284,7 @@ def stop(
     live = list_live_runs()
     chosen = [one for one in live if run is None or one.directory == run.resolve()]
     if not chosen:
-        raise NoGraphError("no graph is running on this computer that could be stopped")
+        raise NoGraphError("no graph is running on this computer, so there is nothing to stop")
     if not stop_all:
         del chosen[1:]
     for each in chosen:

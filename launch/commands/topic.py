@@ -42,7 +42,11 @@ app = make_app("List topics, and read or publish them in the running graph.")
 CountOption = Annotated[
     int | None,
     typer.Option(
-        "-t", "--count", metavar="N", help="Number of messages; default: until Ctrl-C.", min=1
+        "-t",
+        "--count",
+        metavar="N",
+        help="Number of messages after which the command stops; default: it runs until Ctrl-C.",
+        min=1,
     ),
 ]
 WindowOption = Annotated[
@@ -63,7 +67,9 @@ SHORT_ARRAY = 36
 def list_topics(
     list_all: Annotated[
         bool,
-        typer.Option("--all", help="List all defined topics, also those that the graph lacks."),
+        typer.Option(
+            "--all", help="List all defined topics, including those that are not in the graph."
+        ),
     ] = False,
     run: RunOption = None,
     as_json: JsonOption = False,

@@ -62,8 +62,8 @@ def tune(
         typer.Option(
             min=0,
             max=100,
-            help="Number of simulated strokes per configuration that is tested in the graph; 0: "
-            "choose the method of each family separately, without a graph.",
+            help="Number of simulated strokes with which each configuration is tested in the "
+            "graph; 0: choose the method of each family separately, without a graph.",
         ),
     ] = 3,
     folder: Annotated[

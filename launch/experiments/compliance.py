@@ -287,7 +287,7 @@ class ForceSample:
 
     @property
     def model_error_ratio(self) -> float | None:
-        """Return the relative error of the wanted force; None if there is no reference force."""
+        """Return the relative error of the published force `wanted_n`; None without a reference."""
         if self.reference is None:
             return None
         return _relative_error(self.wanted_n, self.reference.force_n)

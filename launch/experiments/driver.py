@@ -110,7 +110,7 @@ class Waiter:
     frames: int
 
     def add_frame(self) -> None:
-        """Postpone the deadline, because the renderer has published a frame."""
+        """Postpone the deadline of the wait, because the renderer has published a frame."""
         if self.frames == 0 or self.deadline.expired() or self.future.done():
             return
         self.frames -= 1
@@ -350,7 +350,7 @@ class Driver:
         self._publish("twin/finger_path", path)
 
     async def follow(self, path: FingerPath) -> None:
-        """Move the finger along a path, and wait until it has reached the end."""
+        """Move the finger along a path, and wait until it has reached the end of the path."""
         self.move_finger(path)
         started = False
 

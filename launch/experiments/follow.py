@@ -122,7 +122,7 @@ def find_least_deviation(
     limits: list[Floats] = []
 
     def add(operator: Any, nominal: Floats, bound: Floats) -> None:
-        """Add the constraint |nominal + operator e| <= bound for the scaled deviations e."""
+        """Add |nominal + operator e| <= bound to the constraints for the scaled deviations e."""
         known = np.isfinite(bound)
         kept = operator[known]
         rows.extend((kept, -kept))
@@ -197,7 +197,7 @@ class RolledSheet:
     on_sheet_m: Floats
 
     def pose(self, lifted_m: float = 0.0) -> Floats:
-        """Return the pose object_from_sheet (4, 4) after a shift by `lifted_m` along the normal."""
+        """Return object_from_sheet (4, 4) after the sheet moves by `lifted_m` along its normal."""
         contact = self.on_sheet_m - np.array([0.0, 0.0, lifted_m])
         return transform(self.rotation, self.point - self.rotation @ contact)
 

@@ -193,13 +193,13 @@ def size_errors_mm(
 
 
 def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
-    """Compute the image errors at all visible points in a simulated case, from both `RAMPS`."""
+    """Compute the errors of the visible image points in a case, from the images of both ramps."""
     x, y = (find_recorded(images, "image", make_pattern_label(label, pattern)) for pattern in RAMPS)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
 def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, ErrorMap]:
-    """Compute the image errors at all visible points in a simulated case, for each eye."""
+    """Compute the errors of the visible image points in a simulated case, for each eye."""
 
     def errors_of(viewpoint: Viewpoint) -> ErrorMap:
         x, y = (

@@ -15,8 +15,9 @@ Therefore ln(1 + w) = 0.674 sigma.
 
 Each trial uses the increment that gives the least expected entropy of the posterior of w. This is
 the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown
-lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w falls
-with the square root of the number of trials; `docs/jnd.md` states the measured error.
+lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w is
+inversely proportional to the square root of the number of trials; `docs/jnd.md` states the
+measured error.
 
 The trials are stored in a CSV file, which is the only state of a session. After an interruption,
 all stored answers are replayed.
@@ -224,7 +225,7 @@ class StaircaseSession:
         self._resume()
 
     def next_trial(self) -> PairTrial | None:
-        """Return the next trial; None after the last trial."""
+        """Return the next trial of the session, or None after the last trial."""
         if self.done >= self.plan.trials:
             return None
         number = self.done + 1

@@ -192,7 +192,7 @@ class CrossErrors:
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return the mean and maximum lengths (mm) of the eyes' errors and the disparity error."""
+        """Return the mean, maximum, per-eye and disparity errors (mm) of the crosses."""
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {

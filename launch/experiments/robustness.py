@@ -42,7 +42,7 @@ def parse_seeds(text: str) -> list[int]:
     if last < first:
         raise ExperimentError(f'--seeds "{text}": {last} is less than {first}; give {last}-{first}')
     if last - first >= MAX_TRIALS:
-        raise ExperimentError(f'--seeds "{text}": at most {MAX_TRIALS} seeds; divide the range')
+        raise ExperimentError(f'--seeds "{text}": more than {MAX_TRIALS} seeds; divide the range')
     return list(range(first, last + 1))
 
 
@@ -75,8 +75,8 @@ def run_robustness(
     """
     if commissioned and calibrated:
         raise ExperimentError(
-            "--commissioned and --calibrated exclude each other: both give calibrated devices; "
-            "give one of the two"
+            "--commissioned and --calibrated cannot be combined, because each of them selects "
+            "calibrated devices; use only one"
         )
     plan = load_graph(launch_file, settings=settings)
     require_scene(plan)

@@ -239,7 +239,7 @@ def make_image_procedure(
 
 
 def make_table_procedure(progress: Progress) -> Procedure:
-    """Make a procedure that waits until the soft body uses a table."""
+    """Make a procedure that waits until the soft body uses a precomputed table."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         await driver.wait_for_table(scene, "quick_table", progress)
@@ -282,7 +282,7 @@ def make_evaluation(
 
 
 def is_path_recorded(bag: Path, label: str) -> bool:
-    """Return whether a bag contains a finger path up to DELIVERY_S after its end."""
+    """Return whether a bag covers a finger path and the DELIVERY_S seconds after the path ends."""
     done_ns: int | None = None
     for _, finger, header, _ in BagReader(bag, topics=["twin/finger"]):
         if isinstance(finger, TwinFinger) and finger.path_label == label and finger.path_done:

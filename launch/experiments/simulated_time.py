@@ -266,7 +266,7 @@ class SimulatedArm:
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge uses: measured, or known in advance."""
+        """Return the servo lag (s) that the bridge uses, which is measured or known in advance."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property

@@ -115,7 +115,7 @@ def draw_hands(count: int, seed: int) -> list[Hand]:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A hand in a control loop that is released near an equilibrium depth."""
+    """A trial in which a hand in a control loop is released near an equilibrium depth."""
 
     hand: Hand
     loop: SampledLoop

@@ -84,7 +84,7 @@ ARM_EVENTS: dict[Side, LatencyEvent] = {
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrames:
-    """The contents of the drawn frames, with the time (ns) at the centre of each frame's display.
+    """The data of displayed frames, with the time (ns) at the centre of each frame's display.
 
     fingertip: drawn fingertip position (3,), m.
     sheet: centre (m) and normal of the drawn sheet, (6,).
@@ -96,7 +96,7 @@ class DrawnFrames:
     deformation_ages: list[tuple[int, Floats]]
 
     def add(self, frame: Frame) -> None:
-        """Add the contents of a frame; frames that were not displayed are ignored."""
+        """Store the data of a displayed frame. Ignore a frame that was not displayed."""
         if not frame.light_ns:
             return
         pose = frame.world_from_sheet
@@ -108,7 +108,7 @@ class DrawnFrames:
             self.deformation_ages.append((frame.light_ns, np.array([age_s])))
 
     def shifted(self, late_ns: int) -> DrawnFrames:
-        """Return the contents with display times that are later by `late_ns`.
+        """Return a copy of the data with display times that are later by `late_ns`.
 
         The ages of the drawn deformation increase by the same time.
         """
@@ -267,9 +267,9 @@ def frame_events(frame: Frame, published_ns: int) -> list[tuple[LatencyEvent, in
 
 
 def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, int, int]]:
-    """Return the events in a message whose latency is measured.
+    """Return those events in a message for which a latency is measured.
 
-    An event is a tuple of its kind, the exposure that caused it (ns), and its time (ns).
+    An event is a tuple: kind, time of the exposure that caused the event (ns), event time (ns).
     """
     exposure_ns = header.source_ns
     match message:
@@ -604,8 +604,9 @@ def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
     if len(times) < 10:
         label = stroke_label(seconds)
         raise ExperimentError(
-            f'the bag contains {len(times)} valid fingertips during "{label}", at least 10 are '
-            "required; check the tracking, then record the experiment again"
+            f"the bag contains {len(times)} valid fingertip measurements during "
+            f'"{label}", but at least 10 are required; check the tracking, then record the '
+            "experiment again"
         )
     scene = recording.scene
     delta_d, delta_theta = sheet_errors(
@@ -655,7 +656,7 @@ def compute_arcs(
 
 
 def _compute_angles(scene: Scene, points: Floats) -> Floats:
-    """Return the angles (n,), rad, of n world points (n, 3) around the axis of the cylinder."""
+    """Return the angles (n,), rad, of n world points (n, 3) around the axis of the object."""
     local = apply(inverse(object_pose(scene)), points)
     return np.asarray(np.arctan2(local[:, 1], local[:, 2]))
 

@@ -80,7 +80,7 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
 
 
 def read_flags(bag: Path) -> list[SuspectedCause]:
-    """Return the error causes that nodes suspected, without repetitions, in order of occurrence."""
+    """Return the error causes that nodes suspected in a bag, without repetitions, in time order."""
     found: dict[SuspectedCause, None] = {}
     for _, message, _, _ in BagReader(bag, topics=["status"]):
         if isinstance(message, Status):

@@ -220,7 +220,7 @@ def check_leftovers() -> Finding:
             "leftovers",
             "warning",
             f"{len(found)} processes are left over from ended launchers: {pids}",
-            "flexsheet doctor --sweep",
+            "run: flexsheet doctor --sweep",
         )
     return Finding("leftovers", "ok", "none")
 

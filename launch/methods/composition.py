@@ -137,7 +137,7 @@ def _add_up(
 
 
 def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
-    """Return the error budget of a metric: the error of each stage that adds to the metric."""
+    """Return the error budget of a metric: the error contribution of each stage, if not zero."""
     parts = {
         stage: option.spreads.get(metric, 0.0) + abs(option.biases.get(metric, 0.0))
         for stage, option in combination.items()
@@ -168,7 +168,7 @@ def list_combinations(stages: Mapping[str, Sequence[StageOption]]) -> list[Combi
 
 
 def cost(combination: Combination) -> float:
-    """Return the number of processor cores that a combination uses."""
+    """Return the number of processor cores that a combination of methods uses."""
     return sum(option.cores for option in combination.values())
 
 
@@ -211,7 +211,7 @@ class Composition:
 
     @property
     def last(self) -> GraphRun:
-        """Return the run of the chosen combination."""
+        """Return the last run of the graph that used the chosen combination of methods."""
         methods = name_methods(self.chosen)
         return next(run for run in reversed(self.runs) if run.methods == methods)
 
@@ -309,7 +309,9 @@ def compose(
     """
     combinations = list_combinations(stages)
     if not combinations:
-        raise ExperimentError("no method of a method family could be measured in this scene")
+        raise ExperimentError(
+            "the tested methods cannot be combined, or a method family has no measured method"
+        )
     least_outside = min(map(_outside, combinations))
     combinations = [one for one in combinations if math.isclose(_outside(one), least_outside)]
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
@@ -429,7 +431,7 @@ def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figu
 
 
 def _outside(combination: Combination) -> float:
-    """Return the fraction of cases that are outside a method's range, summed over all methods."""
+    """Return the sum, over all methods, of the fraction of cases outside the method's range."""
     return sum(option.outside for option in combination.values())
 
 

@@ -379,12 +379,12 @@ def summarize_configuration(
 
 
 def upper_limit(one: Interval) -> float:
-    """Return the upper limit of an interval, or the central value if the limit is infinite."""
+    """Return the upper limit of an interval, or its central value if the limit is infinite."""
     return one.high if np.isfinite(one.high) else one.value
 
 
 def scale(one: Interval, factor: float) -> Interval:
-    """Multiply a value and the limits of its interval by a factor."""
+    """Return an interval with its value and limits multiplied by a factor."""
     return Interval(one.value * factor, one.low * factor, one.high * factor)
 
 

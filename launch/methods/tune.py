@@ -347,7 +347,7 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
 
 
 def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
-    """Return a sort key by which methods with fewer cases outside their range come first."""
+    """Return a sort key that puts methods with fewer cases outside their range first."""
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -591,7 +591,7 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
 
 
 def check_target(source: Path, target: Path) -> None:
-    """Raise BadInputError if the target cannot be written.
+    """Raise BadInputError if the output file `target` cannot be written.
 
     The check runs before a long measurement, so that the result of the measurement is not lost.
     """

@@ -72,8 +72,8 @@ class MeshFile(LimitedModel):
     ]
     smoothing_m: Positive | None = Field(
         default=None,
-        description="length over which the surface is smoothed, m; null: the length that hides "
-        "the facets",
+        description="length over which the surface is smoothed, m; null: a length that hides the "
+        "facets is computed from the mesh",
     )
 
 

@@ -85,7 +85,8 @@ class NodeSpec(StrictModel):
     )
     topics: dict[str, str | None] = Field(
         default={},
-        description="topic of each port whose name differs from the topic; null: not connected",
+        description="topic of each port whose name differs from the topic; null: the port is not "
+        "connected",
     )
     restart: RestartSpec = RestartSpec()
     start_deadline_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
@@ -109,7 +110,7 @@ class NodeSpec(StrictModel):
         le=49,
         description="real-time priority of the process when its nodes are ready: it then "
         "interrupts all processes with a lower or no real-time priority; needs root, CAP_SYS_NICE "
-        "or rtprio in limits.conf; null: none",
+        "or rtprio in limits.conf; null: the process has no real-time priority",
     )
 
 
@@ -202,7 +203,7 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
         raise document.error(
             ("extends",),
             f"circular reference: {base} also extends this file",
-            "remove one of the two `extends`",
+            "remove the key `extends` from one of the files",
         )
     document.extend(read_launch_file(base, chain), MERGED_LEVELS)
     nodes = document.values.get("nodes")
@@ -241,7 +242,7 @@ def apply_setting(document: Document, setting: str) -> None:
     except YAMLError as error:
         reason = str(error).splitlines()[0]
         raise BadInputError.single(
-            origin, (), f'"{text}" is not a value in YAML: {reason}', "quote the value"
+            origin, (), f'"{text}" is not a valid YAML value: {reason}', "quote the value"
         ) from error
     if node in known:
         if not isinstance(document.values["nodes"][node], dict):

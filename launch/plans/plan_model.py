@@ -148,11 +148,11 @@ class ResolvedNode(StrictModel):
     )
     role: NodeRole | None = Field(default=None, description="role that the node class declares")
     liveness_s: float | None = Field(
-        default=None, description="maximum time without a heartbeat, s"
+        default=None, description="maximum time without a heartbeat, s; null: no limit"
     )
     nice: int = Field(default=0, description="niceness of the process; 0 in older bags")
     realtime_priority: int | None = Field(
-        default=None, description="real-time priority of the process; null: none"
+        default=None, description="real-time priority of the process; null: it has none"
     )
     process: str = Field(default="", description="process name; empty if it is the node's name")
 

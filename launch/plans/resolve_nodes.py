@@ -122,7 +122,7 @@ def collect_entries(spec: LaunchFile, document: Document) -> list[NodeEntry]:
             document.report(
                 ("record",),
                 'the graph already has a node "recorder"',
-                'remove either "record" or the node',
+                'remove the key "record" or the node "recorder"',
             )
         else:
             recorder = NodeSpec(type="recorder", parameters=spec.record, nice=RECORDER_NICE)

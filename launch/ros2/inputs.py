@@ -72,14 +72,15 @@ class ExternalInputs:
     def convert(
         self, topic: str, decode: Callable[[], Any], now_ns: int, unix_ns: int
     ) -> tuple[Message, int] | None:
-        """Return a converted ROS message and its source timestamp (ns) on the local clock.
+        """Convert a ROS message to a flexsheet message, and return it with its source timestamp.
+
+        The timestamp (ns) is on the local clock. If the message is rejected, for example because
+        its bytes are malformed, the rejection is counted and None is returned.
 
         decode: function that returns the ROS message, or raises an exception if the bytes are
             malformed.
         now_ns: current time of the local clock.
         unix_ns: current time since 1970, ns.
-
-        Returns None if the message is rejected.
         """
         try:
             if self.scene is None:

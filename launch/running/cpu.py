@@ -98,7 +98,7 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return the main thread's total waiting time (s) for a core, or None if it is unknown."""
+        """Return how long (s) a process's main thread has waited for a core; None if unknown."""
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:

@@ -213,13 +213,13 @@ class Child:
                 on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Let Python's fault handler write the call stacks to the log, then kill the process."""
+        """Make a hanging process write its call stacks to the log, then kill the process."""
         self._reports = False
         self.signal(signal.SIGABRT)
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy available output to the log, and report its lines; return False if there is none."""
+        """Copy new output to the log and report its lines. Return False if there is no output."""
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -574,7 +574,9 @@ class RunningGraph:
         """
         source_ns = self._publish_latched("scene", scene)
         if source_ns is None:
-            raise RuntimeError("a node of the graph publishes the scene; omit it (--without NODE)")
+            raise RuntimeError(
+                "a node of the graph publishes the scene; omit that node (--without NODE)"
+            )
         return source_ns
 
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
@@ -825,7 +827,7 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write each scene that is in the folder of the graph's scene file to `folder`, as JSON.
+        """Write all scenes in the folder of the graph's scene file as JSON files into `folder`.
 
         Nodes that publish scenes read these files.
         """

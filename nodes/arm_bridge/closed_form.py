@@ -188,7 +188,7 @@ class ClosedFormKinematics:
         return np.array(rows).T
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[Branch]:
-        """Return all eight branches, for any flange pose."""
+        """Return all eight branches. They are the same for each flange pose."""
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:

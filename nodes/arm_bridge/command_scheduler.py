@@ -21,7 +21,7 @@ class CommandScheduler:
     idle_period_s: float
 
     def wait_s(self, now_ns: int, sent_ns: int) -> float:
-        """Return the time (s) until the next command may be sent.
+        """Return the time (s) until the next command may be sent to the arm.
 
         The minimum time between two commands is half a period.
         """

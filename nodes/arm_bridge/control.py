@@ -194,12 +194,12 @@ class ArmControl:
 
     @property
     def state(self) -> State:
-        """Return the present state."""
+        """Return the present state of the state machine."""
         return self._state
 
     @property
     def mode(self) -> ArmMode:
-        """Return the mode that the bridge publishes for the present state."""
+        """Return the arm's mode that the bridge publishes for the present state."""
         return "fault" if self._state is State.TAUT and self.faults else MODES[self._state]
 
     @property
@@ -209,7 +209,7 @@ class ArmControl:
 
     @property
     def all_faults(self) -> tuple[str, ...]:
-        """Return the texts about faults, an e-stop and a lost connection, for the other arm."""
+        """Return the published texts about the arm's faults, its e-stop and a lost connection."""
         estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self._state is State.DISCONNECTED else ()
         return (*self.faults, *estop, *lost)
@@ -230,7 +230,7 @@ class ArmControl:
         return self._state is State.IDLE and self.at_rest
 
     def handle(self, event: Event) -> None:
-        """Change the state according to the transition table `TRANSITIONS`."""
+        """Change the state as `TRANSITIONS` specifies for an event in the present state."""
         target = TRANSITIONS[self._state, event]
         if target is None:
             return
@@ -287,7 +287,7 @@ class ArmControl:
         arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
-        """Store the measured joint angles (6,) rad and the faults that the arm has reported.
+        """Store the measured joint angles (6,) rad and the faults that the controller reports.
 
         Stale joint angles are ignored.
         """
@@ -360,9 +360,9 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm; return the reason if the command is refused, otherwise None.
+        """Execute an operator's arming command; return the reason if it is refused, otherwise None.
 
-        age_s: age of the operator's command.
+        age_s: age of the command.
         """
         if not arming.ready:
             self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
@@ -440,7 +440,7 @@ class ArmControl:
         return None
 
     def _settle(self) -> None:
-        """Change the state if an e-stop or a fault is latched, or if the arm is at rest."""
+        """Report a latched e-stop or fault, and then the arm's standstill, to the state machine."""
         for _ in range(2):
             if self.estop_reason is not None:
                 self.handle(Event.ESTOP)

@@ -216,9 +216,11 @@ class ArmGeometry:
         )
 
     def relax_limits(self, flange: Floats, other_flange: Floats) -> SheetLimits:
-        """Return the limits, widened where the arms exceed, or nearly exceed, them at the start.
+        """Return the limits of the sheet and the flanges for one motion.
 
-        flange, other_flange: world poses (4, 4) at the start of a motion.
+        flange, other_flange: world poses (4, 4) of both flanges at the start of the motion.
+
+        A limit that is exceeded, or nearly exceeded, at the start is widened.
         """
         limits = self.sheet_limits
         edge = flange @ self.flange_from_edge

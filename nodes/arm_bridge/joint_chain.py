@@ -273,7 +273,7 @@ class NumericKinematics:
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
-        """Return the branches that reach a flange pose.
+        """Return the branches on which the arm can reach a flange pose.
 
         base_from_flange: n flange poses (n, 4, 4); the first pose that the arm can reach is used.
         """

@@ -219,7 +219,7 @@ class MxtLink:
         return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:
-        """Return the socket, opened if necessary; it receives packets from the controller only."""
+        """Return the socket, which receives only the controller's packets; open it if necessary."""
         if self._socket is None:
             link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             link.setblocking(False)

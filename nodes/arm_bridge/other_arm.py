@@ -102,7 +102,7 @@ class OtherArm:
 
     @property
     def interlock_reason(self) -> str | None:
-        """Return why the other arm's state forbids motion of the own arm; None if it permits it."""
+        """Return why the other arm's state forbids the own arm's motion, or None if it does not."""
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

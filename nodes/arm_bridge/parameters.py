@@ -29,7 +29,8 @@ class ArmBridgeParameters(NodeParameters):
     driver: Driver = Field(default="modbus", description="protocol of the arm's controller")
     timeout_s: Positive | None = Field(
         default=None,
-        description="maximum time to wait for the arm's answer, s; null: the driver's default",
+        description="maximum time to wait for the arm's answer, s; null: the driver's default "
+        "time is used",
     )
     servo_lag_s: NonNegative = Field(
         default=0.03,
@@ -45,8 +46,8 @@ class ArmBridgeParameters(NodeParameters):
     )
     target_period_s: Positive | None = Field(
         default=None,
-        description="period of the sheet targets, s; null: the measured period; its initial value "
-        "is the period of the camera in the scene",
+        description="period of the sheet targets, s; null: the period is measured, and its "
+        "initial value is the period of the camera in the scene",
     )
     hold_after_s: Positive = Field(
         default=0.02,
@@ -75,7 +76,8 @@ class ArmBridgeParameters(NodeParameters):
     motor_force: MotorForceCalibration | None = Field(
         default=None,
         description="calibration for the estimate of the sheet's pull from the motor currents, "
-        "which is published as topic force; only for the driver mxt; null: no estimate",
+        "which is published as topic force; only for the driver mxt; null: the pull is not "
+        "estimated",
     )
 
     @model_validator(mode="after")

@@ -75,7 +75,7 @@ PEAK_TO_MEAN_SPEED = 1.5
 
 @dataclass(frozen=True, slots=True)
 class PathCheckRequest:
-    """The start and the target of the sheet, and the joint angles (6,) rad of both arms."""
+    """The start and the goal of a path of the sheet, and both arms' joint angles (6,) rad."""
 
     start: SheetMotion
     goal: SheetMotion
@@ -108,7 +108,7 @@ def measure_distance(sheet: SheetMotion, target: SheetMotion) -> tuple[float, fl
 
 
 def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[SheetMotion]:
-    """Simulate the sheet's motion to a goal at rest, and return points of the simulated path."""
+    """Simulate the motion of the sheet until it rests at a goal, and return points of its path."""
     resting = replace(goal, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
     sheet, corners = start, [start]
     for step in range(1, round(MAX_REHEARSAL_S / REHEARSAL_STEP_S)):
@@ -142,7 +142,7 @@ class Alignment:
     duration_s: float
 
     def joints_at(self, time_s: float) -> Floats:
-        """Return the joint angles (6,) rad at `time_s` after the start."""
+        """Return the joint angles (6,) rad of the alignment at `time_s` after its start."""
         part = min(1.0, time_s / self.duration_s) if self.duration_s > 0.0 else 1.0
         joints: Floats = self.from_rad + smoothstep(np.array(part)) * (self.to_rad - self.from_rad)
         return joints

@@ -35,19 +35,19 @@ class LastExchange:
     duration_s: float = 0.0
 
     def on_answer(self, now_ns: int) -> None:
-        """Store the time of an answer (ns), and the duration of the exchange."""
+        """Store the arrival time of the arm's answer (ns), and the duration of the exchange."""
         self.measured_ns, self.duration_s = now_ns, (now_ns - self.sent_ns) * 1e-9
 
 
 class LatencyMean:
-    """The mean latency from the camera exposure until the arm has moved."""
+    """A running mean of the latency from the camera exposure until the arm has moved."""
 
     def __init__(self) -> None:
         self._target: Header | None = None
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Add an exchange; ignore it if it has the same target as the last one.
+        """Include the latency of an exchange in the mean, unless its target was included already.
 
         Returns the mean latency (s) after every REPORTED_TARGETS targets, and None in between.
         """

@@ -36,7 +36,7 @@ class ServoCheck:
         self._expected_rad = 0.0
 
     def update(self, estimate: LagEstimate | None, at_ns: int) -> tuple[SelfCheck, ...]:
-        """Add the newest estimate of the servo lag, and return the checks that have enough data.
+        """Include a new estimate of the servo lag in the checks; return those with enough data.
 
         at_ns: time of the estimate.
         """

@@ -70,12 +70,12 @@ class StandstillMonitor:
         self._count, self.is_alive = 0, False
 
     def forget(self) -> None:
-        """Discard the count and the last measured joint angles."""
+        """Discard the count of unchanged measurements and the last measured joint angles."""
         self.restart()
         self._last_rad = np.full(6, np.nan)
 
     def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
-        """Add the joint angles (6,) and joint velocities (6,) of a command for `step_s` seconds."""
+        """Record the joint angles (6,) and velocities (6,) of a command for `step_s` seconds."""
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
         decay = max(0.0, 1.0 - step_s / MEMORY_S)
@@ -91,7 +91,7 @@ class StandstillMonitor:
             self.restart()
 
     def on_measurement(self, joints_rad: Floats, freshness: Freshness) -> None:
-        """Add a measurement of the joint angles (6,) rad."""
+        """Compare measured joint angles (6,) rad with earlier ones to detect rest and jumps."""
         if freshness == Freshness.REPEATED:
             return
         if not freshness.is_usable:

@@ -99,11 +99,11 @@ class EyeFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all earlier values, so that the next value remains unfiltered."""
+        """Discard all earlier values, so that `update` returns the next value unchanged."""
         self._last: tuple[float, Floats, Floats] | None = None
 
     def update(self, at_s: float, value: Floats) -> Floats:
-        """Add a value with n elements (n,), and return the filtered value (n,).
+        """Filter a new value with n elements (n,), and return the filtered value (n,).
 
         at_s: time of the value, which must be later than the time of the previous value.
         """

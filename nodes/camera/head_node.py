@@ -134,7 +134,7 @@ class HeadCamera(Node):
             self.report_error("source", error)
 
     def _receive(self, at_ns: int, pixels: Floats | None) -> None:
-        """Publish the eye positions in one image.
+        """Publish the eye positions that were found in one image.
 
         at_ns: time of the exposure.
         pixels: positions (2, 2) of both eyes, px; None if the image shows no face.
@@ -178,7 +178,7 @@ class HeadCamera(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Publish invalid eyes while no images arrive.
+        """Publish invalid eye positions while no images arrive.
 
         The timestamp is `silence_s` in the past, and therefore older than the timestamp of an image
         that is still being searched.

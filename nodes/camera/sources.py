@@ -45,17 +45,18 @@ class OpenCvSource(CameraSource):
     )
     pixel_format: Annotated[str, Field(min_length=4, max_length=4)] | None = Field(
         default=None,
-        description="pixel format, four characters, such as MJPG; null: OpenCV's default",
+        description="pixel format, four characters, such as MJPG; null: OpenCV's default format "
+        "is used",
     )
     exposure_to_stamp_s: Finite | None = Field(
         default=None,
         description="time from mid-exposure to the driver's timestamp, s; negative if the "
-        "timestamp is the start of the exposure; null: half the exposure time",
+        "timestamp is the start of the exposure; null: half the exposure time is used",
     )
     exposure_to_grab_s: NonNegative | None = Field(
         default=None,
-        description="time from mid-exposure to the image's arrival, s, for drivers without usable "
-        "timestamps; null: half the exposure time",
+        description="time from mid-exposure to the image's arrival, s, for drivers without "
+        "usable timestamps; null: half the exposure time is used",
     )
     silence_s: Positive = Field(
         default=1.0,
@@ -72,7 +73,7 @@ class VideoSource(CameraSource):
         default=None, description="right video file; null: `left` has both views side by side"
     )
     rate_hz: Positive | None = Field(
-        default=None, description="frame rate, Hz; null: the frame times in the files"
+        default=None, description="frame rate, Hz; null: the frame times in the files are used"
     )
     loop: bool = Field(default=False, description="whether to start again at the end")
 
@@ -85,11 +86,13 @@ class ImagesSource(CameraSource):
     right: Path = Field(description="glob pattern of the right images")
     times: Path | None = Field(
         default=None,
-        description="CSV file with a column t_s (time, s), one row per pair; null: constant rate",
+        description="CSV file with a column t_s (time, s), one row per pair; null: the images "
+        "have a constant rate",
     )
     rate_hz: Positive | None = Field(
         default=None,
-        description="image rate, Hz, if `times` is not given; null: the scene's camera rate",
+        description="image rate, Hz, if `times` is not given; null: the camera's rate in the "
+        "scene is used",
     )
     loop: bool = Field(default=False, description="whether to start again at the end")
 

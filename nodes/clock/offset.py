@@ -123,7 +123,7 @@ class OtherClock:
     resets: int = 0
 
     def add(self, sample: Sample) -> None:
-        """Add a sample, unless a sample of the same half second is more accurate."""
+        """Store a new sample, unless a stored sample of the same half second is more accurate."""
         samples = self.samples
         if samples and sample.at_ns <= samples[-1].at_ns:
             return

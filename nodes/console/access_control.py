@@ -236,7 +236,7 @@ class PageConnection(ServerConnection):
         super().send_data()
 
     async def handshake(self, *arguments: Any, **rest: Any) -> None:
-        """Perform the opening handshake; after a malformed one, let the client disconnect."""
+        """Perform the opening handshake. If it is invalid, wait until the client disconnects."""
         try:
             await super().handshake(*arguments, **rest)
         except InvalidHandshake:

@@ -179,7 +179,7 @@ class EyeViewRequester:
         return resolve_method(self.chosen_correction, self._by_scene, "two_pass")
 
     def waited_s(self, now_s: float) -> float:
-        """Return the time (s) since the last change of state."""
+        """Return the time (s) since the state of the request last changed."""
         return now_s - self._since_s
 
     def on_scene(self, scene: Scene) -> None:
@@ -232,7 +232,7 @@ class EyeViewRequester:
         self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:
-        """Start the tracing of the eye view if a frame contains the requested pixels."""
+        """Enter the state TRACING if a frame contains the requested pixels."""
         if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
             self._enter(EyeViewState.TRACING, now_s)
 
@@ -284,11 +284,11 @@ class Replay:
         self.playing = True
 
     def leave(self) -> None:
-        """Close the bag, and show the running graph again."""
+        """Close the replayed bag, and show the running graph again."""
         self.timeline, self.playing = None, False
 
     def seek(self, seconds: float) -> None:
-        """Jump to a time (s) since the start of the bag, limited to the bag's duration."""
+        """Move the replay to a time (s) since the start of the bag, at most the bag's duration."""
         if self.timeline is not None:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
@@ -331,11 +331,12 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """A controller that publishes e-stops, recordings and bookmarks, and saves the console's state.
+    """A publisher of e-stops, recording requests and bookmarks, which saves the console's state.
 
     warn: function that receives an error text if the saved state cannot be used.
 
-    After a restart, the console continues with the saved scene, sliders, finger and recording.
+    After a restart, the console continues with the saved scene, slider positions, finger position
+    and recording request.
     """
 
     def __init__(
@@ -359,7 +360,7 @@ class ConsoleController:
         self.stopped: str | None = None
 
     def begin(self) -> None:
-        """Publish the scene and a running recording again after a restart of the console.
+        """Publish the scene and an active recording request again after a restart of the console.
 
         The messages of the previous console process were lost when it exited.
         """
@@ -383,7 +384,7 @@ class ConsoleController:
         self._publish(EStop(engaged=False, reason="reset at the console"))
 
     def record(self, running: bool) -> None:
-        """Start or stop recording to a bag."""
+        """Request that the recorder starts or stops a recording, and save this request."""
         self.recording = running
         self._publish(Recording(running=running))
         self.save_state()
@@ -400,7 +401,7 @@ class ConsoleController:
         self.save_state()
 
     def save_state(self) -> None:
-        """Save the scene, sliders, recording and finger for a restart of the console."""
+        """Save the scene, slider positions, recording request and finger position for a restart."""
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,

@@ -101,7 +101,7 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Use another picker, because the virtual object has changed.
+        """Replace the picker after a change of the virtual object.
 
         picker: object that selects points on the virtual object; None if the shape is unknown.
         """
@@ -109,7 +109,7 @@ class FingerController:
         self._update_target()
 
     def restore(self, intent: FingerIntent) -> None:
-        """Continue with the requested position that the previous console process saved."""
+        """Move the finger to the requested position that the previous console process saved."""
         self.intent, self.commanded = intent, True
         self._update_target()
 
@@ -122,11 +122,11 @@ class FingerController:
         self._request(position=position, lifted=False)
 
     def move_to(self, x_m: float, y_m: float) -> None:
-        """Move to a position (x, y) as seen from the front, without a change of the depth."""
+        """Request a finger position (x, y) as seen from the front. The depth does not change."""
         self._request(position=Ray.from_front(x_m, y_m))
 
     def push(self, depth_m: float) -> None:
-        """Push to a depth below the surface at the requested position.
+        """Request a push of the finger to a depth below the surface at the requested position.
 
         Raises ValueError if the depth exceeds the scene's working range.
         """
@@ -139,7 +139,7 @@ class FingerController:
         self._request(depth_m=depth_m, lifted=False)
 
     def lift_or_lower(self) -> None:
-        """Lift the finger above the requested position, or lower a lifted finger."""
+        """Request that the finger is lifted above the requested position, or lowered again."""
         self._request(lifted=not self.intent.lifted)
 
     def _request(self, **changes: object) -> None:

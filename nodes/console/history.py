@@ -23,13 +23,13 @@ class History:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
 
     def add(self, now_s: float, source: MessageSource) -> None:
-        """Add a sample at the time `now_s`, and remove samples older than half a minute."""
+        """Store the latencies at the time `now_s`, and delete those older than half a minute."""
         self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Return the n times (n,), in s relative to the latest sample, and the latency series.
+        """Return the n times (n,), in s relative to the latest sample, and all latency series.
 
         The series (n,) are in ms. If a value is missing, it is NaN.
         """

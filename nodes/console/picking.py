@@ -126,9 +126,9 @@ class SurfacePicker:
 
         finger, target: present and requested position (3,), m.
 
-        The step is at most `max_step_m` long. The step ends at most `depth_m` below the surface, or
-        at the present depth if the present depth is larger. If a step around the object makes no
-        progress, the step is straight.
+        The step is at most `max_step_m` long. It ends at most `depth_m` below the surface, or at
+        the depth of `finger` if that is deeper. The path goes around the object. If this makes no
+        progress, the step goes straight towards the target.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

@@ -40,7 +40,7 @@ def list_scene_names(folder: Path) -> list[str]:
 
 
 def load(folder: Path, name: str) -> Scene:
-    """Load a scene of the run's folder; raise SceneChoiceError if the name is unknown."""
+    """Load a scene from the run's folder; raise SceneChoiceError if the name is unknown."""
     names = list_scene_names(folder)
     if name not in names:
         raise SceneChoiceError(f'unknown scene "{name}"; choose one of: {", ".join(names)}')

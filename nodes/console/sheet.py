@@ -99,6 +99,6 @@ def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
 
 @lru_cache(maxsize=1)
 def _fractions() -> tuple[Floats, Floats]:
-    """Return two arrays (n, 1): the fractions of width and height at which the n vertices are."""
+    """Return the n vertices' positions as fractions of width and height: two arrays (n, 1)."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)

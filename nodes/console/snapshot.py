@@ -80,7 +80,7 @@ def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
 
 
 def _skin(source: MessageSource) -> Floats | None:
-    """Return the n vertices (n, 3), m, of the object's surface mesh.
+    """Return the n vertices (n, 3), m, of the object's surface mesh, or None if there is no mesh.
 
     Before the first result of the solver, the vertices of the undeformed object are returned.
     """

@@ -119,7 +119,7 @@ class SoftBodyBenchmark:
         return body, model
 
     def coarsest(self) -> SceneBody:
-        """Return the body with its linear method for the largest distance between skin nodes."""
+        """Return the soft body with the coarsest skin mesh, which uses the linear method."""
         return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
 
     def sample(self) -> SamplePoint:
@@ -305,11 +305,11 @@ class ReferenceSet:
 
 
 def _ignore_progress(done: int, total: int) -> None:
-    """Do nothing, because all results are in the cache."""
+    """Ignore progress reports, because the solutions are usually in the cache."""
 
 
 def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return the benchmark of all methods over the push depths of a scene's working range."""
+    """Return the benchmark of all soft-body methods up to the maximum push depth of a scene."""
     max_depth_m = scene.working_range.push_depth_m
     return SoftBodyBenchmark(
         scene,
@@ -350,5 +350,5 @@ def _family(methods: Sequence[str], **changes: Any) -> Family:
 SOFT_BODY = _family([*LINEAR_SPACINGS_M, *TABLE_SPACINGS_M, NEWTON])
 SOFT_BODY_LINEAR = _family([*LINEAR_SPACINGS_M], table_m={}, newton_m=())
 SOFT_BODY_TABLES = _family([*TABLE_SPACINGS_M], linear_m={}, newton_m=())
-"""The benchmarks of all methods (`SOFT_BODY`), of only the linear methods (`SOFT_BODY_LINEAR`) and
-only the nonlinear tables (`SOFT_BODY_TABLES`). The precomputation of the tables takes minutes."""
+"""The benchmarks of all methods (`SOFT_BODY`), of the linear methods only (`SOFT_BODY_LINEAR`), and
+of the nonlinear tables only (`SOFT_BODY_TABLES`). Precomputing the tables takes minutes."""

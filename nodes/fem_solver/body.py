@@ -131,7 +131,7 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact; its stiffness is that at the front of the object."""
+        """Return the response without contact, with the stiffness at the front of the object."""
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),

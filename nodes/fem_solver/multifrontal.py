@@ -51,7 +51,7 @@ class Front:
 
 @dataclass(frozen=True, slots=True)
 class Factors:
-    """The Cholesky factors L of a stiffness matrix K = L L^T, in the precision of K."""
+    """The Cholesky factors L of a stiffness matrix K = L L^T, in the number format of K."""
 
     fronts: list[Front]
     diagonal: list[Floats]

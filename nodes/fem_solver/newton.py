@@ -346,7 +346,7 @@ class NeoHookeanBody:
         )
 
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
-        """Raise NewtonNotConvergedError for an inverted element or a fingertip inside the body."""
+        """Raise NewtonNotConvergedError if an element is inverted or the finger is in the body."""
         ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
             raise NewtonNotConvergedError(
@@ -369,7 +369,7 @@ class NeoHookeanBody:
         target: Floats,
         factors: Factors | None,
     ) -> Floats:
-        """Predict to first order the displacement (n, 3), m, for a finger at `target` (3,), m."""
+        """Predict to first order the displacement (n, 3), m, after the finger moves to `target`."""
         if factors is None:
             return displacement
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)

@@ -16,18 +16,19 @@ class FemSolverParameters(NodeParameters):
     method: MethodChoice = Field(
         default="auto",
         description="Method that computes the deformation. auto: the method that the scene "
-        "specifies, or nonlinear_table if the scene specifies none. nonlinear_table: a missing "
-        "table is computed in the background. A coarse table is ready after about a minute.",
+        "specifies is used, or nonlinear_table if the scene specifies none. nonlinear_table: a "
+        "missing table is computed in the background. A coarse table is ready after about a "
+        "minute.",
     )
     skin_spacing_m: Positive | Literal["auto"] = Field(
         default="auto",
         description="Distance between mesh nodes on the touchable surface. auto: the value that "
-        "the scene specifies, or 0.003 if the scene specifies none.",
+        "the scene specifies is used, or 0.003 if the scene specifies none.",
     )
     compute_table: bool = Field(
         default=True,
-        description="Whether a missing nonlinear table is computed in the background with the "
-        "method auto. false: the linear method is used until the table is in the cache.",
+        description="Whether a missing nonlinear table is computed in the background if the "
+        "method is auto. false: the linear method is used until the table is in the cache.",
     )
     linear_depth_m: Positive = Field(
         default=0.006,
@@ -42,7 +43,7 @@ class FemSolverParameters(NodeParameters):
     friction_ratio: NonNegative = Field(
         default=0.0,
         description="Friction coefficient between finger and object. 0: the finger slides without "
-        "friction. Above 0, the linear method is used.",
+        "friction. If it is above 0, the linear method is used.",
     )
     step_budget_s: Positive = Field(
         default=0.004,
@@ -52,7 +53,8 @@ class FemSolverParameters(NodeParameters):
     workers: int = Field(
         default=0,
         ge=0,
-        description="Number of processes that compute a nonlinear table. 0: one per core.",
+        description="Number of processes that compute a nonlinear table. 0: one process per "
+        "core is used.",
     )
     scheduler: str | None = Field(
         default=None,
@@ -61,16 +63,16 @@ class FemSolverParameters(NodeParameters):
     )
     prediction_horizon_s: NonNegative = Field(
         default=0.0,
-        description="Time after the camera exposure for which the fingertip is predicted.",
+        description="Time from the camera exposure to the predicted fingertip position.",
     )
     hold_s: NonNegative = Field(
         default=0.1, description="Time for which the deformation is kept after the finger is lost."
     )
     relax_s: Positive = Field(
         default=0.15,
-        description="Time constant with which the deformation decays after `hold_s`.",
+        description="Time constant with which the deformation decays after the time `hold_s`.",
     )
     cache_dir: Path | None = Field(
         default=None,
-        description="Folder of precomputed results. null: the cache folder of the user.",
+        description="Folder of precomputed results. null: the user's cache folder is used.",
     )

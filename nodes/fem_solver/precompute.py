@@ -68,11 +68,11 @@ class SoftBodySpec:
         return 3 if self.sticking else 1
 
     def depends_on(self) -> list[object]:
-        """Return all inputs of the result as a JSON value."""
+        """Return all inputs of the linear response as a JSON value."""
         return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
 
     def key(self) -> str:
-        """Return a digest of the inputs and of `VERSION`, which identifies the result."""
+        """Return a digest of the inputs and of `VERSION`, which identifies the linear response."""
         return make_digest(self.depends_on())
 
 
@@ -111,7 +111,7 @@ class ResponseBudget:
         )
 
     def require_memory(self, skin_spacing_m: float) -> None:
-        """Raise MemoryError if the computer has too little free memory."""
+        """Raise MemoryError if the computer has too little free memory for the precomputation."""
         require_memory(
             self.working_bytes + self.table_bytes,
             f"the precomputation of {self.loads} loads on {self.skin_nodes} skin nodes",
@@ -290,11 +290,11 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""The names of arrays in the cache file that differ from the field names, which are the keys."""
+"""The names of arrays in the cache file, by field name, where both names differ."""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
-    """Return the cache key of a linear response, and its conversion to arrays and back."""
+    """Return the cache key of a linear response, and its functions for encoding and decoding."""
 
     def encode(model: SoftBodyModel) -> dict[str, NDArray[Any]]:
         content = {"triangles": model.triangles, "bounds": model.bounds}

@@ -122,7 +122,7 @@ class WorkersError(FlexsheetError, RuntimeError):
     """Raised if the workers that compute snapshots cannot be used."""
 
     code = "workers"
-    remedy = "Follow the remedy in the text."
+    remedy = "Follow the advice in the error text."
 
 
 class LostWorkersError(WorkersError):
@@ -138,7 +138,7 @@ def code_version() -> str:
 
 
 def make_table_cache(spec: TableSpec) -> Specification[Table]:
-    """Return the cache key of a nonlinear table, and its conversion to arrays and back."""
+    """Return the cache key of a nonlinear table, and its functions for encoding and decoding."""
     return Specification(
         "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
     )

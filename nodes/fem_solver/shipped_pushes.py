@@ -26,12 +26,12 @@ LEVELS = 32767
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path of the file with shipped snapshots of a table. The file need not exist."""
+    """Return the path at which the package may contain a file with the snapshots of a table."""
     return FOLDER / entry.path(FOLDER).name
 
 
 def load_shipped(path: Path) -> dict[str, Snapshot]:
-    """Load shipped snapshots by name from a file; the result is empty if the file is missing."""
+    """Load the snapshots in a file, by name. Return an empty dict if the file does not exist."""
     content = load_arrays(path)
     if content is None:
         return {}

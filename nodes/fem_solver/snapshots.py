@@ -334,7 +334,7 @@ def _spacing_m(spec: MeshSpec, finger_radius_m: float) -> float:
 
 
 def has_focused_meshes(spec: MeshSpec) -> bool:
-    """Return whether the shape supports meshes that are fine only near one point."""
+    """Return whether a body's shape and support permit meshes that are fine near only one point."""
     return not isinstance(spec.geometry, Cylinder) or isinstance(spec.support, StripSupport)
 
 

@@ -46,8 +46,8 @@ snapshots."""
 MIN_COSINE = -0.25
 """The minimum cosine of the angle between the deformed and the undeformed normal of a triangle."""
 END_SPAN_M = 0.00125
-"""The distance (m) from the end of the valid depth range to the deepest solution. The responses to
-deeper pushes approach this solution."""
+"""The difference (m) between the greatest solved depth and the greatest valid depth. The responses
+to pushes beyond the valid depth approach the response at the greatest solved depth."""
 FADE_RATIO = 2.0
 """The distance beyond the edge of the touchable skin, in finger radii, over which the displacement
 decreases to zero."""
@@ -290,7 +290,7 @@ class CubicInterpolator:
     """
 
     def __init__(self, depths_m: Floats) -> None:
-        """Compute the cubic polynomials for L depths (L,), m. At least four depths are required."""
+        """Compute the cubic polynomials between L >= 4 increasing depths (L,), m."""
         count = len(depths_m)
         self._depths = depths_m.tolist()
         values = np.eye(count)

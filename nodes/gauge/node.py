@@ -36,7 +36,8 @@ class GaugeParameters(NodeParameters):
     )
     zero_units: Finite = Field(
         default=0.0,
-        description="reading without contact, in displayed units, which is subtracted",
+        description="reading without contact, in displayed units; it is subtracted from each "
+        "reading",
     )
     standard_deviation_n: NonNegative = Field(
         default=0.02, description="standard deviation of noise and calibration error, N"

@@ -37,8 +37,8 @@ DELAY_MARGIN_S = 0.02
 additional gain that the loop must tolerate."""
 
 MAX_SLOPE = 20.0
-"""The upper limit of the slope in the search for the critical slope. The planner uses much smaller
-slopes."""
+"""The upper limit of the slope (sheet offset divided by finger depth) in the search for the
+critical slope. The planner uses much smaller slopes."""
 
 SLOPES = 32
 """The number of slopes at which the search evaluates the decay rate."""
@@ -80,8 +80,8 @@ Mussa-Ivaldi, Hogan and Bizzi 1985 (arm). The damping ratios of wrist and arm ar
 """
 
 LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in name)
-"""The hands with low damping. They determine the bounds, because they become unstable at smaller
-slopes than other hands."""
+"""The hands with low damping. They determine the bounds on the slope, because their control loops
+become unstable at smaller slopes than those of other hands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,11 +120,13 @@ def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[flo
 def make_loop_matrices(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the matrices (k, n, n) that map the n states over one period, for k slopes (k,).
+    """Return the state-transition matrices (k, n, n) of the control loop over one sampling period.
 
-    The states are the depth and its rate, the filter's estimates of both, and recent sheet offsets
-    from newest to oldest. The offsets include the last two that the sheet has reached, and all that
-    it has not reached yet.
+    slopes (k,): sheet offset divided by the measured finger depth, one value for each matrix.
+
+    The n states are the depth and its rate, the filter's estimates of both, and recent sheet
+    offsets from newest to oldest. The offsets include the last two that the sheet has reached, and
+    all that it has not reached yet.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1

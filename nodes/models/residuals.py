@@ -58,7 +58,7 @@ class ResidualMonitor:
         return float(np.linalg.norm(self.mean))
 
     def add(self, residual: Floats, at_ns: int) -> None:
-        """Add a residual vector measured at the time `at_ns`; ignore it if it is not finite."""
+        """Update the mean with a residual measured at `at_ns`. Ignore it if it is not finite."""
         if not np.isfinite(residual).all():
             return
         step_s = 0.0 if self._last_ns is None else (at_ns - self._last_ns) * 1e-9

@@ -19,7 +19,7 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 GRID_STEP_S = 0.004
-"""The step (s) of the grid of lags. A parabola gives the minimum between grid points."""
+"""The step (s) of the grid of lags. A parabola gives the best lag between grid points."""
 
 MEMORY_S = 1.2
 """The time constant, in seconds, with which the weight of samples decays."""
@@ -139,7 +139,7 @@ class ServoLagEstimator:
         self._last_s: float | None = None
 
     def on_command(self, at_s: float, joints_rad: Floats) -> None:
-        """Add commanded joint angles (6,), rad, that were sent at the time `at_s`."""
+        """Record commanded joint angles (6,), rad, that were sent at the time `at_s`."""
         if not (math.isfinite(at_s) and _are_joints(joints_rad)):
             self.restart()
             return
@@ -218,7 +218,7 @@ class ServoLagEstimator:
             self._timing_s += weight / self._timing_weight * (timing_s - self._timing_s)
 
     def _solve(self) -> LagEstimate | None:
-        """Return the lag of smallest error variance, or None if the motion is insufficient."""
+        """Return the lag with the smallest error variance, or None if it is not determined."""
         if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
             return None
         if not self._speed_square >= MIN_SPEED_RAD_PER_S**2:
@@ -258,7 +258,7 @@ def _are_joints(joints_rad: Floats) -> bool:
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Return the mean (6,) and the total variance after a value (6,) of the weight `gain`."""
+    """Update a mean (6,) and a total variance by a value (6,) with the weight `gain`."""
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square

@@ -76,8 +76,8 @@ value, the sheet feels 1.5 times as stiff as without an advance. The bounds that
 loop with the hand stable are usually lower."""
 
 SLOPE_TOLERANCE = 0.03
-"""The tolerance by which slopes of the offset may exceed their bounds. The bounds contain larger
-safety margins."""
+"""The tolerance by which the slope d(offset) / d(depth) may exceed its bounds. The bounds contain
+larger safety margins."""
 
 STRETCH_CANDIDATES = 17
 """The number of stretch ratios between the minimum and the maximum ratio that are tried."""

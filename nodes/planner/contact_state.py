@@ -123,7 +123,7 @@ class ContactStateMachine:
         self._nearest_point = first.point
 
     def step(self, finger: Floats, velocity: Floats, object_from_sheet: Floats) -> ContactCommand:
-        """Return the command for a finger at the position (3,) m with the velocity (3,) m/s.
+        """Return the contact command for a finger position (3,), m, and velocity (3,), m/s.
 
         object_from_sheet: the sheet's present pose (4, 4), from which a new contact starts.
         """
@@ -163,7 +163,7 @@ class ContactStateMachine:
         return ContactCommand("approach", reason, self.contact, twist, 0.0)
 
     def _begin_contact(self, contact: SheetContact, object_from_sheet: Floats) -> SheetContact:
-        """Return the contact at which the finger touches the sheet.
+        """Return the contact that begins when the finger touches the sheet.
 
         object_from_sheet: the sheet's present pose (4, 4).
         """
@@ -246,7 +246,7 @@ class ContactStateMachine:
         return rolled, "past_sheet_width" if axis == 0 else "past_sheet_height"
 
     def _lift(self, contact: SheetContact) -> SheetContact:
-        """Lift the sheet above the surface of a concave object around the contact."""
+        """Return the contact with the sheet lifted above a concave surface around the contact."""
         lift_m = self._shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
         return replace(contact, lift_m=lift_m)
 

@@ -28,7 +28,7 @@ class HysteresisCorrection:
         self._depth_m, self._direction = 0.0, 1.0
 
     def update(self, depth_m: float) -> float:
-        """Add a depth (m) of the finger, and return the ratio of force to elastic force."""
+        """Update the model with a new finger depth (m); return the force over the elastic force."""
         if depth_m <= 0.0:
             self._depth_m, self._direction = 0.0, 1.0
             return 1.0

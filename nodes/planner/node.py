@@ -40,7 +40,7 @@ from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlann
 
 FIRST_HORIZON_S = 0.05
 MAX_FUTURE_S = 0.005
-"""The maximum time (s) by which a fingertip's timestamp may be in the future."""
+"""The maximum time (s) by which the timestamp of a fingertip message may be in the future."""
 
 
 def _is_finite(fingertip: Fingertip) -> bool:

@@ -47,7 +47,7 @@ class OscillationWatchdog:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all measurements and set the weight to 1."""
+        """Discard all measurements, and set the weight of the offset's motion to 1."""
         self.weight = 1.0
         self._slow: tuple[float, float] | None = None
         self._last = (0.0, 0.0)
@@ -56,7 +56,7 @@ class OscillationWatchdog:
         self._fading = False
 
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
-        """Add a measurement, and return the weight (0 to 1) of the offset's motion.
+        """Process a new measurement, and return the weight (0 to 1) of the offset's motion.
 
         depth_m: measured depth.
         offset_m: offset of the sheet at the time of the measurement.

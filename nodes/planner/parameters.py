@@ -20,13 +20,13 @@ class PlannerParameters(NodeParameters):
 
     prediction_horizon_s: NonNegative | None = Field(
         default=None,
-        description="time from the camera exposure to the time for which the sheet is planned, s; "
-        "null: the mean age of fingertips plus the actuation delay",
+        description="time from the camera exposure to the time for which the sheet is planned, "
+        "s; null: the mean age of the fingertip measurements plus the actuation delay is used",
     )
     actuation_delay_s: NonNegative = Field(
         default=0.036,
-        description="time from a fingertip's publication until the sheet has moved, s. If "
-        "measure_actuation_delay is true, this is the initial value",
+        description="time from the publication of a fingertip measurement until the sheet has "
+        "moved, s. If measure_actuation_delay is true, this is the initial value",
     )
     measure_actuation_delay: bool = Field(
         default=True, description="whether to use the actuation delay that the arms measure"
@@ -53,8 +53,8 @@ class PlannerParameters(NodeParameters):
 
     sheet_calibration: SheetCalibrationFile | None = Field(
         default=None,
-        description="calibration file from `flexsheet calibrate sheet`; null: ideal rubber with "
-        "the modulus in the scene",
+        description="calibration file from `flexsheet calibrate sheet`; null: the sheet is "
+        "modelled as ideal rubber with the modulus in the scene",
     )
     sheet_force: SheetForceMethod | Literal["auto"] = Field(
         default="auto",
@@ -63,7 +63,8 @@ class PlannerParameters(NodeParameters):
     )
     cache_dir: Path | None = Field(
         default=None,
-        description="folder of cached tables of the sheet's force; null: the user's cache",
+        description="folder of cached tables of the sheet's force; null: the user's cache folder "
+        "is used",
     )
     contact_on_m: float = Field(
         default=0.0005, description="distance between finger and sheet at which contact starts, m"
@@ -71,7 +72,9 @@ class PlannerParameters(NodeParameters):
     contact_off_m: Positive = Field(
         default=0.003, description="distance between finger and sheet at which contact ends, m"
     )
-    max_age_s: Positive = Field(default=0.1, description="maximum age of a usable fingertip, s")
+    max_age_s: Positive = Field(
+        default=0.1, description="maximum age of a fingertip measurement that the planner uses, s"
+    )
     tilt_margin_rad: NonNegative = Field(
         default=0.14,
         description="angle by which the sheet may exceed working_range.tilt_rad of the scene, rad",

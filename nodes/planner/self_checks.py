@@ -88,7 +88,7 @@ class MeasuredForceCheck:
         self._monitor = ResidualMonitor(1, threshold=MAX_FORCE_RATIO)
 
     def add_push(self, push: PlannedPush) -> None:
-        """Add a planned push, and compare earlier measured forces with the sheet model.
+        """Store a planned push, and compare earlier measured forces with the sheet model.
 
         Only forces that were measured at least QUIET_S before this push takes effect are compared.
         """
@@ -98,7 +98,7 @@ class MeasuredForceCheck:
             self._compare(*self._waiting.popleft())
 
     def add_force(self, force: Force, at_ns: int) -> None:
-        """Add a valid force along the sheet's normal that was measured at `at_ns`."""
+        """Store a force, measured at `at_ns`, if it is valid and along the sheet's normal."""
         if force.valid and force.axis == "sheet_normal":
             self._waiting.append((at_ns, force.force_n))
 

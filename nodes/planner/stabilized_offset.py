@@ -35,7 +35,7 @@ class StabilizedOffset:
         bandwidth_rad_per_s: float,
         delay_s: float,
     ) -> tuple[float, float]:
-        """Add a measured depth, and return the offset (m) and its rate (m/s).
+        """Process a measured depth, and return the sheet's offset (m) and its rate (m/s).
 
         offset_at_depth: function from the depth (m) to the offset (m).
         step_s: time since the last measurement.

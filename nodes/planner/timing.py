@@ -11,8 +11,8 @@ MIN_STEP_NS = 1_000_000
 """The minimum plausible interval (ns) between two exposures. No camera has a higher frame rate."""
 
 AGE_WEIGHT = 0.05
-"""The weight of the newest value in the exponential average of the age of fingertips. At 60
-fingertips per second, the time constant is 0.33 s."""
+"""The weight of the newest value in the exponential average of the age of fingertip measurements.
+At 60 measurements per second, the time constant is 0.33 s."""
 
 DELAY_WEIGHT = 0.11
 """The weight of the newest value in the exponential average of an arm's latency. At 5 values per
@@ -31,10 +31,10 @@ class MonotonicTimestampFilter:
         self._late_ns: list[int] = []
 
     def update(self, source_ns: int, first_step_s: float) -> float | None:
-        """Return the time (s) since the last accepted fingertip; None to drop the new fingertip.
+        """Return the time (s) since the last accepted message; None if the new message is dropped.
 
-        source_ns: time of the exposure of the new fingertip.
-        first_step_s: result for the first fingertip and after a restart.
+        source_ns: time of the exposure from which the new message was computed.
+        first_step_s: result for the first message and after a restart.
         """
         last_ns = self._last_ns
         if last_ns is not None and source_ns < last_ns + MIN_STEP_NS:
@@ -48,11 +48,12 @@ class MonotonicTimestampFilter:
 
 
 class ActuationDelayEstimator:
-    """An estimator of the time from the publication of a fingertip to the arms' motion.
+    """An estimator of the time from the publication of a fingertip message to the arms' motion.
 
     delay_s: mean delay of both arms, or the initial value before any report.
 
-    The delay is the latency that an arm reports, minus the mean age of fingertips at publication.
+    The delay is the latency that an arm reports, minus the mean age of the fingertip measurements
+    at publication.
     """
 
     def __init__(self, initial_s: float, max_s: float) -> None:
@@ -62,14 +63,14 @@ class ActuationDelayEstimator:
         self._delays_s: dict[Side, float] = {}
 
     def on_fingertip(self, age_s: float) -> None:
-        """Add the age (s) of a valid fingertip at its publication."""
+        """Record the age (s) that a valid fingertip measurement had when it was published."""
         before_s = age_s if self._age_s is None else self._age_s
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 
     def on_latency(self, side: Side, latency_s: float) -> None:
-        """Add the reported time (s) from the exposure until an arm has moved.
+        """Update the delay with the latency (s) from exposure to motion that an arm reports.
 
-        An implausible time is ignored.
+        An implausible latency is ignored.
         """
         if self._age_s is None or not 0.0 <= latency_s - self._age_s <= self._max_s:
             return

@@ -1,4 +1,4 @@
-"""Plan the motion of the sheet after each measured fingertip."""
+"""Plan the motion of the sheet after each fingertip measurement."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ MAX_DEPTH_FRACTION = 1.4
 through the object."""
 
 MAX_STEP_S = 0.1
-"""The time since the last fingertip after which the sheet restarts from rest, because the arms have
-stopped."""
+"""The time since the last fingertip message after which the sheet restarts from rest, because the
+arms have stopped."""
 
 KEEP_S = 0.15
 """The time (s) for which a trajectory continues with constant velocity. If a packet is lost, it is
@@ -151,7 +151,7 @@ class SheetTrajectoryPlanner:
         moved_m: float,
         speed_m_per_s: float,
     ) -> float:
-        """Update the offset behind the tangent plane, and return the offset's rate (m/s).
+        """Update the sheet's offset behind the tangent plane, and return its rate (m/s).
 
         moved_m, speed_m_per_s: predicted displacement and speed of the finger along the normal.
         """

@@ -59,7 +59,7 @@ class Recorder(Node):
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
-        """End the bag before the disk is full, and start a new bag when space is free again."""
+        """End the bag before the disk is full; start a new bag when enough space is free again."""
         self._recording.check_disk()
         self.note = self._recording.note
 

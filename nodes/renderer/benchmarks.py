@@ -39,8 +39,8 @@ pushed."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 LOWER_BOUND, TWO_PASS_TRIANGLES = "lower_bound", "two_pass_triangles"
-"""The names of two benchmark methods. The first gives the lower bound of the time. The second is
-the method two_pass for a sheet that consists of four triangles."""
+"""The names of two benchmark methods. The first measures a lower bound on the drawing time. The
+second is the method two_pass with a sheet mesh of four triangles."""
 CORRECTION_OF: dict[str, Correction] = {
     LOWER_BOUND: "none",
     **{correction: correction for correction in CORRECTIONS},
@@ -127,7 +127,7 @@ def _lay_sheet(scene: Scene, tilt_rad: float, contact_m: tuple[float, float]) ->
 
 
 def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """Return the limits of the scene's working range as tilts (degrees) and push depths (mm)."""
+    """Return cases (tilt in degrees, push depth in mm) at the limits of a scene's working range."""
     tilt = round(float(np.degrees(scene.working_range.tilt_rad)), 1)
     return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 

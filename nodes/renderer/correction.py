@@ -34,10 +34,10 @@ GRAZING_SINE = 0.05
 on the sheet is stretched by a factor of 20."""
 
 NEAR_M = 0.02
-"""The minimum distance (m) of drawn points in front of the eye."""
+"""The minimum distance (m) from the eye, along the z axis, at which points are drawn."""
 
 MIN_PUSH_M = 1e-4
-"""The minimum push depth for a screen of four triangles instead of a plane."""
+"""The minimum push depth (m) at which the screen is four triangles instead of a plane."""
 
 
 @dataclass(frozen=True, slots=True)

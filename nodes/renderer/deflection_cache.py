@@ -50,7 +50,7 @@ Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return the rubber (size, material) of a scene's sheet, and the range of required pushes."""
+    """Return a scene's rubber, and the ranges of stretch and depth of its deflection shapes."""
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(
@@ -62,7 +62,7 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Return the cache key of a scene's deflection shapes, and their conversion to arrays and back.
+    """Return the cache key of a scene's deflection shapes, and functions for encoding and decoding.
 
     The shapes do not depend on the thickness and Young's modulus of the sheet.
     """

@@ -12,7 +12,8 @@ VSYNC_MARGIN_S = 0.0005
 """The minimum time (s) between the end of drawing and the buffer swap that shows the frame."""
 
 ON_TIME_FRACTION = 0.85
-"""The fraction of frames that must be drawn before the predicted swap (buffer exchange)."""
+"""The fraction of recent frames whose drawing would have ended before the predicted swap (buffer
+exchange)."""
 
 
 class DisplayLatencyEstimator:

@@ -42,7 +42,11 @@ class EyePredictor:
         self._clock: tuple[str, int] | None = None
 
     def add(self, eye: Eye, header: Header) -> None:
-        """Add a message; delete earlier positions if it is invalid, late or of another clock."""
+        """Store the eyes' position from a valid message.
+
+        Delete the earlier positions if the message is invalid, out of order or from another clock,
+        or if it arrives after a long gap.
+        """
         clock, at_ns = (header.clock_id, header.epoch), header.source_ns
         known = self._positions
         if not eye.valid:

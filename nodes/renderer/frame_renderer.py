@@ -211,7 +211,7 @@ class FrameRenderer:
 
 
 def is_touched(fingertip: Fingertip | None, soft_body: SoftBody | None) -> bool:
-    """Return whether a finger is tracked (which may touch the object) or the object is deformed."""
+    """Return whether the object is deformed, or may be touched because a finger is tracked."""
     if fingertip is not None and fingertip.valid:
         return True
     return soft_body is not None and bool(soft_body.displacement_world_m.any())

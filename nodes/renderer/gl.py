@@ -101,7 +101,7 @@ class ImagePart:
 
     @contextmanager
     def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
-        """Restrict drawing to this part's area and colour channels until the context exits."""
+        """Restrict drawing in `frame` to this part's area and colours until the context exits."""
         whole = frame.viewport
         frame.viewport, frame.color_mask = self.viewport, (*self.channels, True)
         if self.is_grey:
@@ -197,7 +197,7 @@ class Canvas:
         self.context.finish()
 
     def begin(self, *, multisampled: bool) -> None:
-        """Select the framebuffer for the next image as `target`, and clear it."""
+        """Set `target` to the framebuffer for the next image, and clear this framebuffer."""
         self.target = self._frame if multisampled else self._single
         self.target.clear(0.0, 0.0, 0.0, 1.0)
 
@@ -367,7 +367,7 @@ class _MeshBuffers:
 
 
 def _grid_surface() -> ObjectSurface:
-    """Return a square with sides of 300 mm on the plane z = 0."""
+    """Return the mesh of a square with sides of 300 mm on the plane z = 0."""
     cells = 60
     axis = np.linspace(-0.15, 0.15, cells + 1)
     x, y = np.meshgrid(axis, axis)

@@ -49,9 +49,9 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
     needed = REACH_MARGIN * max(float(np.hypot(*corner)) for corner in corners)
     if largest < needed:
         raise ValueError(
-            f"projector.lens.distortion: {lens.distortion} maps several rays to one pixel, because "
-            f"its maximum slope is {largest:.3f}, but the corners of the image need {needed:.3f}; "
-            "calibrate the projector again with points in the whole image"
+            f"projector.lens.distortion: {lens.distortion} maps several rays to one pixel: it "
+            f"is invertible up to the ray slope {largest:.3f}, but the image corners need "
+            f"{needed:.3f}; calibrate the projector again with points in the whole image"
         )
     reach = min(fold, 4.0 * needed)
     return ClipLens(

@@ -22,7 +22,7 @@ class MaxAge:
     """
 
     def __init__(self, given_s: float | None = None) -> None:
-        """Set a fixed maximum age (s); None derives it from the measured period of the camera."""
+        """Set a fixed maximum age (s), or derive it from the camera's period if it is None."""
         self.seconds = MIN_AGE_S if given_s is None else given_s
         self._is_given = given_s is not None
         self._last: Header | None = None

@@ -32,7 +32,7 @@ class WindowError(FlexsheetError, RuntimeError):
     """Raised if the requested window cannot be opened or was lost."""
 
     code = "window"
-    remedy = "Set the renderer's `monitor` to one that the text lists, or `output: headless`."
+    remedy = "Set `monitor` to a monitor that the error text lists, or set `output` to headless."
 
 
 @contextmanager

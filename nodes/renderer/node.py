@@ -131,7 +131,7 @@ class Renderer(Node):
 
     @periodic("rate_hz")
     def refresh(self) -> None:
-        """Handle the window's events, and draw a frame if no message has triggered a frame."""
+        """Handle the window's events, and draw a frame if no message has triggered one in time."""
         if not self._output.poll():
             self._reopen()
         if self.clock.now_ns() > self._due_ns + self._period_ns:

@@ -25,7 +25,8 @@ class RendererParameters(NodeParameters):
     )
     monitor: str | int | None = Field(
         default=None,
-        description="Monitor of the projector, by name or number. null: an ordinary window.",
+        description="Monitor of the projector, by name or number. null: an ordinary "
+        "window is used.",
     )
     swap_interval: int = Field(
         default=1,
@@ -41,14 +42,16 @@ class RendererParameters(NodeParameters):
     )
     display_latency_s: NonNegative = Field(
         default=0.008,
-        description="Time, s, from the swap to the middle of the frame's display. This is half of "
+        description="Time, s, from the buffer swap "
+        "to the middle of the frame's display. This is half of "
         "the time for which a frame is shown, plus the projector's delay. Without a window, the "
         "time starts at the end of drawing.",
     )
     max_age_s: Positive | None = Field(
         default=None,
-        description="Maximum age, s, of poses, fingertips, eyes and soft bodies that are used. "
-        "null: four measured camera periods, limited to the range 0.1 s to 0.5 s.",
+        description="Maximum age, s, of messages about poses, fingertips, eyes and soft bodies "
+        "that are used. null: four times the measured camera period is used, limited to the range "
+        "0.1 s to 0.5 s.",
     )
     spacing_m: Positive = Field(
         default=0.004,
@@ -75,7 +78,8 @@ class RendererParameters(NodeParameters):
     )
     cache_dir: Path | None = Field(
         default=None,
-        description="Folder of the sheet's deflection shapes. null: the cache folder of the user.",
+        description="Folder of the sheet's deflection shapes. null: the user's cache folder is "
+        "used.",
     )
     stereo: StereoMode | Literal["auto"] = Field(
         default="auto",

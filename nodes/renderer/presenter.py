@@ -59,7 +59,7 @@ def make_slot(context: moderngl.Context, size: tuple[int, int]) -> Slot:
 
 
 class Presenter:
-    """A thread that owns a window's OpenGL context and shows the images given to `put`."""
+    """A thread that owns a window's OpenGL context and shows the images that `put` receives."""
 
     def __init__(
         self,

@@ -67,7 +67,7 @@ class EyePicture:
 
     @staticmethod
     def make(context: moderngl.Context, size: tuple[int, int], samples: int) -> EyePicture:
-        """Allocate framebuffers for an image of a size (width, height), px."""
+        """Allocate the framebuffers for an eye's image of a given size (width, height), px."""
         image = context.texture(size, 4)
         image.repeat_x = image.repeat_y = False
         if not samples:

@@ -69,7 +69,7 @@ MAX_WINDOW_M = 0.3
 """The maximum distance (m) of the edges of the drawn rectangle from the centre of the imaginary
 screen."""
 MIN_REPORTED_FRACTION = 0.005
-"""The minimum unlit fraction of a folded sheet that a note reports."""
+"""The unlit fraction of a folded sheet above which the attribute `note` reports the folds."""
 NO_SHAPES_NOTE = (
     "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles; "
     "run flexsheet precompute"
@@ -212,7 +212,7 @@ class SceneRenderer:
         )
 
     def surface_point(self, world_point: Floats) -> Floats:
-        """Return the point (3,), world frame, m, of the undeformed object nearest to a point."""
+        """Return the point (3,), m, of the undeformed surface nearest to a world point (3,), m."""
         start = None
         if self._near is not None:
             _, vertex = self._near.query(world_point)
@@ -221,7 +221,10 @@ class SceneRenderer:
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> SheetPose:
-        """Return an unstretched sheet on the plane z = 0, used until the arms' poses are known."""
+        """Return the pose of an unstretched sheet on the plane z = 0.
+
+        This pose is used until the poses of the arms are known.
+        """
         half = 0.5 * self.scene.sheet.width_m * np.array([1.0, 0.0, 0.0])
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)

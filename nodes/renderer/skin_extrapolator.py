@@ -32,7 +32,11 @@ class SkinExtrapolator:
         self._clock_id = ""
 
     def add(self, body: SoftBody, header: Header) -> None:
-        """Add a response; delete earlier ones of another mesh, method or clock, or later time."""
+        """Store a response of the soft-body solver.
+
+        Delete the earlier responses if they have another mesh, method or clock, or if their last
+        time is not before the time of this response.
+        """
         last = self._history[-1][1] if self._history else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
         at_ns = header.source_ns + round(body.prediction_horizon_s * 1e9)
@@ -64,7 +68,10 @@ class SkinExtrapolator:
         return body, newest_ns + round(ahead_s * 1e9)
 
     def _before(self, newest_ns: int) -> tuple[SoftBody, float] | None:
-        """Return a suitable older response, and the time (s) from it to the newest response."""
+        """Return an older response that is suitable for the extrapolation, and its age (s).
+
+        The age is the time from the older response to the newest response at `newest_ns`.
+        """
         older = [((newest_ns - at_ns) * 1e-9, body) for at_ns, body in list(self._history)[:-1]]
         for base_s, body in older:
             if MIN_BASE_S <= base_s <= MAX_BASE_S:

@@ -70,7 +70,8 @@ ratio is the mean square error of the weighted sum divided by the mean square er
 model."""
 
 OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
-"""The time constant and the minimum number of points for averaging an outdated error covariance."""
+"""The time constant and the minimum number of points for averaging the covariance of the filters'
+errors if it is outdated."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
 """The weight (in points) and the value of the initial variance of prediction errors. The variance
@@ -85,7 +86,7 @@ difference between the predictions. It is necessary because the covariance of th
 estimated from only a few seconds."""
 
 COMBINE_EVERY_POINTS = 4
-"""The number of points after which the weights are computed again."""
+"""The number of measured points after which the weights of the models are computed again."""
 
 MIN_GAIN = 0.1
 """The minimum ratio of the prediction's variance to the variance of a measured point. The gain of

@@ -29,7 +29,7 @@ class ExternalFingertip:
         self._horizons_s = make_horizons_s(limits.prediction_horizon_s)
 
     def update(self, at_ns: int, measured_m: Floats) -> Fingertip:
-        """Add a measured position (3,), m, in the world frame, and return the tracked fingertip."""
+        """Track the fingertip with a measured world position (3,), m, and return its message."""
         low, high = self._volume
         reason: FingertipReason = "outside_volume"
         if ((measured_m >= low) & (measured_m <= high)).all():
@@ -37,5 +37,5 @@ class ExternalFingertip:
         return self._tracker.make_fingertip(at_ns, reason, measured_m, horizons_s=self._horizons_s)
 
     def predict(self, at_ns: int) -> Fingertip:
-        """Predict the fingertip at a time without a measured position, and mark it as invalid."""
+        """Return a message, marked as invalid, with the fingertip predicted for a time."""
         return self._tracker.make_fingertip(at_ns, "no_marker", None, horizons_s=self._horizons_s)

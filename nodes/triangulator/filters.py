@@ -43,7 +43,7 @@ class Filter(Protocol):
         ...
 
     def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
-        """Return the position (3,) m, the velocity (3,) m/s, and their joint covariance (6, 6)."""
+        """Return an estimate's position (3,) m, velocity (3,) m/s, and joint covariance (6, 6)."""
         ...
 
     def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:

@@ -308,7 +308,10 @@ class SystematicError:
     moving: float
 
     def covariance(self, motion: tuple[float, float]) -> Floats:
-        """Return the covariance (2, 2), px^2, of the systematic error for a motion (x, y), px."""
+        """Return the covariance (2, 2), px^2, of the systematic error.
+
+        motion: motion (x, y) of the marker during the exposure, px.
+        """
         variance = self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
         return np.array([[variance, 0.0], [0.0, variance]])
 

@@ -51,7 +51,7 @@ class OscStream(LimitedModel):
 
     address: Annotated[str, Field(pattern="^/")] = Field(
         description="OSC address. Its messages contain x, y, z, or x, y, z and a quaternion x, y, "
-        "z, w. Texts in the messages are ignored"
+        "z, w. String arguments of the messages are ignored"
     )
     world_from_source: tuple[Row, Row, Row] = Field(
         default=IDENTITY,
@@ -72,7 +72,7 @@ class OscInputParameters(NodeParameters):
         "this node on the computer that sends the positions",
     )
     port: Annotated[int, Field(ge=0, le=65535)] = Field(
-        default=9000, description="UDP port; 0: any free port"
+        default=9000, description="UDP port; 0: any free port is used"
     )
     eye: OscStream | None = Field(
         default=OscStream(address="/flexsheet/eye"),
@@ -114,8 +114,8 @@ class OscInputParameters(NodeParameters):
         addresses = [one.address for one in (self.eye, self.fingertip) if one is not None]
         if not addresses or len(set(addresses)) < len(addresses):
             raise ValueError(
-                "osc_input: eye and fingertip are both null or have the same address; give at "
-                "least one of them, and different addresses"
+                "osc_input: eye and fingertip are both null or have the same address; set at "
+                "least one of them, and use different addresses"
             )
         return self
 

@@ -14,7 +14,7 @@ WITHOUT_DATA = "TFNI"
 
 
 def read_packet(data: bytes) -> Iterator[tuple[str, list[float]]]:
-    """Yield the address and the numbers of each message in a packet; texts are skipped.
+    """Yield the address and the numbers of each message in a packet. Skip string arguments.
 
     Raises ValueError or struct.error if the bytes are not an OSC packet.
     """
@@ -26,7 +26,7 @@ def read_packet(data: bytes) -> Iterator[tuple[str, list[float]]]:
         (size,) = struct.unpack_from(">i", data, offset)
         end = offset + 4 + size
         if size <= 0 or end > len(data):
-            raise ValueError(f"OSC bundle of {len(data)} bytes: an element size is {size} bytes")
+            raise ValueError(f"OSC bundle of {len(data)} bytes: invalid element size {size}")
         yield from read_packet(data[offset + 4 : end])
         offset = end
 
@@ -35,7 +35,7 @@ def _read_message(data: bytes) -> tuple[str, list[float]]:
     address, offset = _read_text(data, 0)
     tags, offset = _read_text(data, offset)
     if not address.startswith("/") or not tags.startswith(","):
-        raise ValueError("OSC message: it does not begin with an address and a type tag string")
+        raise ValueError("the OSC message does not begin with an address and a type tag string")
     numbers = []
     for tag in tags[1:]:
         if tag in FORMATS:
@@ -50,6 +50,6 @@ def _read_message(data: bytes) -> tuple[str, list[float]]:
 
 
 def _read_text(data: bytes, offset: int) -> tuple[str, int]:
-    """Return a text that ends with a zero byte, and the offset after its padding."""
+    """Return the string that begins at `offset`, and the offset after its zero bytes."""
     end = data.index(b"\0", offset)
     return data[offset:end].decode("ascii"), end + 4 - (end - offset) % 4

@@ -19,21 +19,22 @@ class TriangulatorParameters(NodeParameters):
     calibration: CameraCalibrationFile | None = Field(
         default=None,
         description="calibration file from `flexsheet calibrate stereo`; null: the optics in the "
-        "scene",
+        "scene are used",
     )
     marker_calibration: MarkerCalibrationFile | None = Field(
         default=None,
-        description="calibration file from `flexsheet calibrate marker`; null: the scene's "
-        "finger.marker_from_pad_m",
+        description="calibration file from `flexsheet calibrate marker`; null: "
+        "finger.marker_from_pad_m of the scene is used",
     )
     marker: MarkerMethod | Literal["auto"] = Field(
         default="auto",
-        description="method that refines the marker's centre; auto: the method in the scene, or "
-        "subpixel_fit if the scene names none",
+        description="method that refines the marker's centre; auto: the method in the scene is "
+        "used, or subpixel_fit if the scene names none",
     )
     marker_noise_px: Positive | None = Field(
         default=None,
-        description="standard deviation of a marker's centre, px; null: the method's estimate",
+        description="standard deviation of a marker's centre, px; null: the estimate of the method "
+        "that refines it is used",
     )
     marker_radius_m: Positive = Field(
         default=0.003, description="true radius of the marker (ball or flat disc), m"
@@ -58,19 +59,20 @@ class TriangulatorParameters(NodeParameters):
     tracking: TrackingMethod | Literal["auto"] = Field(
         default="auto",
         description="tracking method that filters and predicts the fingertip; auto: the method "
-        "in the scene, or adaptive if the scene names none",
+        "in the scene is used, or adaptive if the scene names none",
     )
     max_acceleration_m_per_s2: Positive = Field(
         default=60.0,
-        description="maximum acceleration of a finger, m/s^2; points that imply more are rejected",
+        description="maximum acceleration of a finger, m/s^2; a point that requires a larger "
+        "acceleration is rejected",
     )
     track_timeout_s: Positive = Field(
         default=0.1,
-        description="maximum time without a point before the track is lost, s; at least 2.5 camera "
-        "periods are used",
+        description="time without a measured point after which the track is lost, s; at least 2.5 "
+        "camera periods are used",
     )
     confirm_frames: Annotated[int, Field(ge=1)] = Field(
-        default=3, description="number of consecutive points that are needed to start a track"
+        default=3, description="number of consecutive points that are required to start a track"
     )
     prediction_horizon_s: Positive = Field(
         default=0.12, description="duration of the predicted path, s"

@@ -86,7 +86,7 @@ class ProjectionCheck:
         self._latency = ResidualMonitor(1, threshold=LATENCY_THRESHOLD_S, memory_s=LATENCY_MEMORY_S)
 
     def on_frame(self, frame: Frame) -> None:
-        """Store the expected positions of the projected check marks in a displayed frame."""
+        """Store the expected positions of the check marks from the message of a displayed frame."""
         if frame.light_ns and self._count and len(frame.marks_world_m) == self._count:
             normal = frame.world_from_sheet[:3, 2]
             expected = (frame.light_ns, frame.marks_world_m, frame.marks_finger_ratio, normal)

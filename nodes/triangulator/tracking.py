@@ -79,7 +79,7 @@ class Gate:
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Return whether a measured point can be inside the gate, given its noise."""
+        """Return whether the true position of a measured point can be inside the gate."""
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
@@ -102,7 +102,7 @@ INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
 
 
 class Tracker:
-    """A tracker of one finger."""
+    """A tracker that filters the measured positions of one marker and predicts its path."""
 
     def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
         self.filter, self.settings = filter_, settings
@@ -271,7 +271,7 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Append a point to `previous`, or start a new sequence if both cannot be one track."""
+        """Return `previous` with a new point appended, or only this point if it does not fit."""
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]

@@ -332,7 +332,7 @@ class Controller:
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Simulate the motion for `duration_s`, including the watchdog."""
+        """Simulate the arm's motion and the watchdog for the time `duration_s`."""
         end_s = self._time_s + duration_s
         while self._pending and self._pending[0][0] <= end_s:
             due_s, wanted_rad = self._pending.popleft()

@@ -46,7 +46,7 @@ class TwinArmsParameters(SimulatorParameters):
 
     host: Loopback = "127.0.0.1"
     left_port: ListenPort = Field(
-        default=5020, description="network port of the left simulated arm; 0: any free port"
+        default=5020, description="network port of the left simulated arm; 0: any free port is used"
     )
     right_port: ListenPort = 5021
     rate_hz: Positive = 140.8
@@ -56,7 +56,7 @@ class TwinArmsParameters(SimulatorParameters):
     )
     backlash_rad: NonNegative = Field(
         default=3e-5,
-        description="backlash of each gear, rad; the default is 0.02 mm at the flange",
+        description="backlash of each gear, rad; the default corresponds to 0.02 mm at the flange",
     )
     watchdog_s: Positive = 0.1
     protocol: Literal["modbus", "mxt"] = "modbus"
@@ -74,7 +74,9 @@ class TwinArmsParameters(SimulatorParameters):
         description="file that stores the joint angles, so that a restart does not move the arms; "
         "null: the angles are not stored",
     )
-    fault: Fault = Field(default="none", description="simulated fault of the arm `fault_side`")
+    fault: Fault = Field(
+        default="none", description="simulated fault of the arm on the side `fault_side`"
+    )
     fault_side: Literal["left", "right"] = "left"
     fault_after_s: NonNegative = Field(
         default=0.0, description="time from the start of the arms until the fault begins, s"

@@ -333,7 +333,8 @@ def _markers(board: Board) -> NDArray[np.bool_]:
     number = getattr(cv2.aruco, board.dictionary, None)
     if not isinstance(number, int) or not board.dictionary.startswith("DICT_"):
         raise BoardError(
-            f"board.dictionary: OpenCV has no dictionary {board.dictionary}; give one of cv2.aruco,"
+            f"board.dictionary: OpenCV has no dictionary {board.dictionary}; "
+            "give the name of a dictionary in cv2.aruco,"
             " for instance DICT_4X4_50"
         )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
@@ -347,7 +348,7 @@ def _markers(board: Board) -> NDArray[np.bool_]:
     if len(squares) > len(dictionary.bytesList):
         raise BoardError(
             f"board: {len(squares)} white squares need a marker each, but {board.dictionary} has "
-            f"only {len(dictionary.bytesList)}; choose a larger dictionary"
+            f"only {len(dictionary.bytesList)} markers; choose a larger dictionary"
         )
     black = np.zeros((board.rows + 1, board.columns + 1, cells, cells), dtype=np.bool_)
     for marker, (row, column) in enumerate(squares):

@@ -179,7 +179,7 @@ def together(*parts: Clutter) -> Clutter:
     sheets = [part.sheet for part in parts if part.sheet is not None]
     if len(sheets) > 1:
         raise ValueError(
-            f"the clutter has {len(sheets)} sheets; give one, because a sheet fills the plane z = 0"
+            f"the clutter has {len(sheets)} sheets; use one, because a sheet fills the plane z = 0"
         )
     return Clutter(
         sheet=sheets[0] if sheets else None,

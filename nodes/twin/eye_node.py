@@ -49,7 +49,8 @@ class TwinEyeParameters(SimulatorParameters):
     )
     projector: Projector | None = Field(
         default=None,
-        description="true projector, in the format of the scene file; null: the scene's projector",
+        description="true projector, in the format of the scene file; null: the scene's "
+        "projector is used",
     )
     eye_stale_s: Positive = Field(
         default=0.1,
@@ -185,10 +186,11 @@ class TwinEyeNode(Node):
         return self.parameters.viewpoint if frame.eye == "both" else frame.eye
 
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
-        """Return the true world position (3,), m, of the virtual camera at the time `at_s`.
+        """Return the true world position (3,), m, of the simulated eye at the time `at_s`.
 
-        The tracked eyes are used. If no eyes are tracked, the eyes in the scene are used. The
-        offset in the parameter `apparatus` (true hardware parameters) is added.
+        The viewpoint is one of the tracked eyes, or their midpoint. If no eyes are tracked, the
+        eyes of the true scene are used. The offset of tracked eyes in the parameter `apparatus`
+        (true hardware parameters) and the simulated head motion are added.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

@@ -36,7 +36,7 @@ class FingerPathError(FlexsheetError, ValueError):
     """Raised if the simulated finger cannot follow a path."""
 
     code = "finger-path"
-    remedy = "Slow the path down, or correct the point or line that the text names."
+    remedy = "Slow the path down, or correct the point or line that the error text names."
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,), m/s, on the lines; the rounded motion is not faster."""
+        """Return the speeds (n - 1,), m/s, along the lines. The rounded motion is not faster."""
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 

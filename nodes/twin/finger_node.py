@@ -69,7 +69,7 @@ class TwinFingerParameters(SimulatorParameters):
     cache_dir: Path | None = Field(
         default=None,
         description="folder that caches the table of the sheet's force on the finger, which is "
-        "used if the parameter `hand` is coupled; null: the user's cache folder",
+        "used if the parameter `hand` is coupled; null: the user's cache folder is used",
     )
 
 

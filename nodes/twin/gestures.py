@@ -111,7 +111,7 @@ def _sampled_times(duration_s: float) -> Floats:
 
 
 def touched(motion: Sampled) -> Sampled:
-    """Add an approach from above, short rests and a lift to a motion on the surface."""
+    """Return a motion on the surface with an approach from above, short rests and a lift added."""
     times, places = motion
     first, last = places[0], places[-1]
     above_first, above_last = (np.array([*place[:2], HOVER_M]) for place in (first, last))
@@ -131,13 +131,13 @@ def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
 
 
 def hold(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Touch the object lightly, and hold the finger still for 5 s."""
+    """Return a path on which the finger touches the object lightly and rests there for 5 s."""
     touch = (0.0, 0.0, -TOUCH_M)
     return _on_surface(scene, "hold", minimum_jerk(touch, [(5.0, touch)]))
 
 
 def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Hold the finger still in the air for 5 s, with the large tremor of an extended arm."""
+    """Return a path on which the finger hovers for 5 s, with the tremor of an extended arm."""
     place = (0.0, 0.0, 0.5 * HOVER_M)
     times, places = minimum_jerk(place, [(5.0, place)])
     return place_path(scene, "hover", times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
@@ -163,12 +163,12 @@ def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed:
 
 
 def reach(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move the finger to the object and back at normal speed, with rests of 0.4 s."""
+    """Return a path to the object and back at normal speed, with rests of 0.4 s."""
     return _reaches(scene, "reach", REACH_PEAK_M_PER_S, 0.4, seed)
 
 
 def reach_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move the finger to the object and back at high speed, with rests of 0.1 s."""
+    """Return a path to the object and back at high speed, with rests of 0.1 s."""
     return _reaches(scene, "reach-fast", 3.0 * REACH_PEAK_M_PER_S, 0.1, seed)
 
 
@@ -182,7 +182,9 @@ def _taps(
     lift_m: float,
     seed: int,
 ) -> FingerPath:
-    """Tap `count` times near one position. The intervals vary by 5 %, and the positions by 2 mm.
+    """Return a path of `count` taps near one position.
+
+    The intervals vary by 5 %, and the positions by 2 mm.
 
     In a tap, the finger moves from `lift_m` above the surface to PRESS_M below the surface, rests,
     and moves back. It does not brake before contact.
@@ -207,12 +209,12 @@ def _taps(
 
 
 def tap(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Tap three times a second, with 120 ms of contact per tap."""
+    """Return a path of three taps a second, with 120 ms of contact per tap."""
     return _taps(scene, "tap", count=15, every_s=0.333, contact_s=0.12, lift_m=0.012, seed=seed)
 
 
 def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Tap as fast as people can: 5.4 times a second, with 85 ms of contact per tap."""
+    """Return a path of taps as fast as people can: 5.4 a second, with 85 ms of contact each."""
     return _taps(
         scene, "tap-fast", count=25, every_s=0.185, contact_s=0.085, lift_m=0.006, seed=seed
     )
@@ -225,7 +227,7 @@ def _arc_run(scene: Scene) -> tuple[float, float]:
 
 
 def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move the finger in strokes around the surface, with sudden stops.
+    """Return a path of strokes around the surface, with sudden stops.
 
     The finger stops in the middle and at the end of each stroke. There are three strokes in each
     direction.
@@ -242,7 +244,7 @@ def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move the finger back and forth around the surface, and reverse suddenly at random times."""
+    """Return a path back and forth around the surface, with sudden reversals at random times."""
     half, speed = _arc_run(scene)
     generator = np.random.default_rng(seed)
     turn_s = 2.0 * BRAKE_S
@@ -292,7 +294,7 @@ def _drawing_m(scene: Scene) -> float:
 
 
 def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move along four circles on the surface, at the typical speed of exploration."""
+    """Return a path of four circles on the surface, at the typical speed of exploration."""
     radius = _drawing_m(scene)
     times, angle = _rounds(4, 2.0 * np.pi * radius / EXPLORE_M_PER_S)
     places = np.stack(
@@ -302,7 +304,7 @@ def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move along three figures of eight on the surface, slowly where the curvature is high."""
+    """Return a path of three figures of eight on the surface, slower where they curve strongly."""
     radius = _drawing_m(scene)
     # The length of the figure, integrated numerically, is 6.1 radii.
     times, angle = _rounds(3, 6.1 * radius / EXPLORE_M_PER_S)

@@ -51,8 +51,8 @@ sheet."""
 MAX_ITERATIONS = 80
 
 UNDAMPED_ROUNDS = 6
-"""The number of equilibria, in one step of the finger, between two halvings of the changes of the
-friction forces. Without this damping, the changes could alternate."""
+"""The interval, in equilibria of one finger step, at which the factor on the friction forces'
+changes is halved. Without this damping, the changes could alternate."""
 
 MAX_FRICTION_ROUNDS = 30
 """The maximum number of equilibria that are solved per finger step while nodes slip."""

@@ -360,7 +360,8 @@ def _read_recording(csv_path: Path) -> Floats:
     columns = [name.strip() for name in lines[0].split(",")] if lines else []
     if missing := [name for name in wanted if name not in columns]:
         raise FingerPathError(
-            f"{csv_path}: the first line names no column {missing[0]}; required: "
+            f"{csv_path}: the first line does not name the column {missing[0]}; the "
+            f"required columns are "
             f"{', '.join(wanted)}"
         )
     rows: list[list[float]] = []

@@ -211,7 +211,8 @@ class TwinCamera:
         """Render the static background of both cameras.
 
         camera: true lenses and poses of the stereo camera.
-        nail: marker position and finger direction; None if the marker is a bead at the fingertip.
+        nail: placement of the marker relative to the fingertip, and direction of the finger. If it
+            is None, the marker is a bead at the fingertip.
         skew_s: exposure time of the right image minus the exposure time of the left image.
         """
         self.camera = camera
@@ -603,7 +604,7 @@ def _disc_points(normal: Floats) -> Floats:
 
 @lru_cache(maxsize=4)
 def _slopes(lens: Lens, width: int, height: int) -> Floats:
-    """Return x/z and y/z (height, width, 2) of the rays through all pixels."""
+    """Return the slopes x/z and y/z (height, width, 2) of the rays through all pixels."""
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     slopes = slopes_of(lens, pixels.astype(np.float64))
     slopes.setflags(write=False)

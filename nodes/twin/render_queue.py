@@ -50,15 +50,15 @@ class RenderQueue(Generic[J]):
         return is_new
 
     def add(self, key: Key, job: J) -> None:
-        """Append a job, or replace the waiting job with the same key."""
+        """Append a job to the queue, or replace the waiting job with the same key."""
         self._jobs[key] = job
 
     def next(self) -> tuple[Key, J]:
-        """Return the key and the content of the oldest job, which remains in the queue."""
+        """Return the key of the oldest job, and the job. The job remains in the queue."""
         return next(iter(self._jobs.items()))
 
     def finish(self, key: Key, now_ns: int) -> None:
-        """Remove a rendered job, and store the time of its rendering."""
+        """Remove a rendered job from the queue, and store `now_ns` as its rendering time."""
         self._jobs.pop(key, None)
         self._rejected.discard(key)
         self._recent_ns[key] = now_ns

@@ -126,7 +126,7 @@ class SheetPull:
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Add the tension at the edges' distance to the history of hysteresis and creep."""
+        """Record the sheet's tension at an edge distance in the history of hysteresis and creep."""
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio

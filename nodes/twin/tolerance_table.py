@@ -43,7 +43,7 @@ class Distribution(Protocol):
     """The interface of a probability distribution of one quantity."""
 
     def draw(self, random: np.random.Generator) -> Any:
-        """Return a random sample."""
+        """Return a random value of the quantity."""
         ...
 
     def at(self, sigmas: float) -> Any:

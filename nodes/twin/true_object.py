@@ -92,7 +92,7 @@ class TrueBody:
         if displacement.shape != skin_vertices.shape:
             raise ValueError(
                 f"the displacement has {len(displacement)} vertices, but the skin has "
-                f"{len(skin_vertices)}; give both from the same mesh"
+                f"{len(skin_vertices)}; use the displacement and the skin of one mesh"
             )
         corners, weights = self._on_skin(skin_vertices, skin_triangles)
         return self._object(self._rest + np.einsum("vc,vcx->vx", weights, displacement[corners]))

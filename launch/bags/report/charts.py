@@ -59,7 +59,7 @@ class Chart:
 
 
 def draw_charts(session: Session) -> dict[str, Chart]:
-    """Draw all charts for which the bag contains data, and return the charts by name."""
+    """Draw all charts for which the bag contains data. The keys of the result are chart names."""
     makers: dict[str, Callable[[Session], Chart | None]] = {
         "timeline": timeline,
         "latency": latencies,
@@ -95,7 +95,7 @@ def _over_time(axes: Axes, session: Session) -> None:
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Mark each value whose two neighbours are NaN, because a line does not show such a value."""
+    """Draw a dot at each value between two NaN values, because a line does not show it."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         has_neighbour = np.zeros_like(known)

@@ -129,7 +129,7 @@ class PortTotals:
             self.age.add(0, port.age_s)
 
     def totals(self) -> tuple[int, int, int]:
-        """Return the numbers of messages that all subscribers skipped, lost and refused."""
+        """Return the numbers of skipped, lost and refused messages, summed over all subscribers."""
         now = [count_undelivered(port) for _, port in self.newest.values()]
         skipped, lost, refused = sum(now, self.offset).tolist()
         return skipped, lost, refused
@@ -362,7 +362,7 @@ class Session:
         flow.last_ns = log_ns
 
     def finish(self) -> None:
-        """Complete the summary after all messages have been added."""
+        """Complete the summary of the session after all messages of the bag have been added."""
         self.errors.finish()
         for arm in self.arms.values():
             ends_s = [

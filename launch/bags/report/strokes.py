@@ -95,7 +95,7 @@ class FingerRun:
         return self.zero_ns + round(begin_s * 1e9), min(finish_ns, self.end_ns)
 
     def figures(self) -> dict[str, Any]:
-        """Return figures (numbers) about how accurately the sheet followed the finger."""
+        """Return the label and duration of the finger path, and the sheet's errors along it."""
         seconds = (self.done_ns - self.zero_ns) * 1e-9
         return {"path": self.label, "seconds": seconds, **self.followed.figures()}
 
@@ -157,7 +157,7 @@ class SheetErrors:
         self.runs: list[FingerRun] = []
 
     def add(self, message: Any, source_ns: int) -> None:
-        """Add a message of the bag. The source timestamps of all messages must be on one clock."""
+        """Process a message of the bag. All source timestamps must be on one clock."""
         match message:
             case Scene():
                 self.finish()
@@ -207,7 +207,7 @@ class SheetErrors:
             side.edges[name == "right"].append((source_ns, row))
 
     def _is_following(self, at_ns: int) -> float:
-        """Return 1 if both arms follow a sheet target that follows the finger, otherwise 0."""
+        """Return 1 if the finger moves the sheet target and both arms follow the target, else 0."""
         arms = [self._arms.get(side) for side in ("left", "right")]
         both = all(arm is not None and arm[1] and at_ns - arm[0] <= SILENT_NS for arm in arms)
         return float(both and not self._target_holds)
@@ -307,7 +307,7 @@ class SheetErrors:
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:
-    """Return, for each path of the simulated finger in a bag, how accurately the sheet followed."""
+    """Return the errors of the sheet along each path of the simulated finger in a bag."""
     errors = SheetErrors(Grid(0, 1.0, 1))
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
         errors.add(message, header.source_ns)

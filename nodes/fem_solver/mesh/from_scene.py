@@ -59,8 +59,9 @@ SAMPLES = 16
 """The number of samples along each side of the bounding box for the estimate of the node count."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""Measured factors that correct the estimated number of nodes. `INNER_FACTOR` and `SKIN_FACTOR`
-correct inner and skin nodes. The other two then correct the sum for a cylinder and a mesh file."""
+"""Measured factors that correct the estimated numbers of nodes: `INNER_FACTOR` inside the object,
+and `SKIN_FACTOR` on its skin. The sum of both numbers is then multiplied by `CYLINDER_FACTOR` if
+the object is a cylinder, or by `MESH_FACTOR` if it is a mesh file."""
 MAX_LOST_FRACTION = 0.1
 """The maximum fraction of an object's volume that the mesh is allowed to omit."""
 
@@ -321,7 +322,7 @@ def _require_fixed_back(spec: MeshSpec, fixed: Bools, normals: Floats) -> None:
         raise UnfitMeshError(
             f"object.support: the support of the kind {spec.support.kind} fixes "
             f"{fixed[back].sum()} of {back.sum()} nodes at the back of the plane's slab, which "
-            "represents a half-space; give support: {kind: strip, angle_rad: 1.0}"
+            "represents a half-space; set support to {kind: strip, angle_rad: 1.0}"
         )
 
 

@@ -41,7 +41,7 @@ ANCHORS = (30.0, 3.0, 0.3, 0.0)
 first value for which the radius ratios of all elements exceed `GOOD_RATIO` is used."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
-"""The maximum number of elements of a lattice, relative to the lattice with fewest elements."""
+"""The maximum number of elements of a lattice, divided by the minimum number over all lattices."""
 
 
 def map_lattice(template: CuboidMap, u: Floats) -> tuple[Floats, Floats]:

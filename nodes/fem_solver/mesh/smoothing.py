@@ -20,10 +20,11 @@ from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from flexsheet.nodes.models.shapes import Shape
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""The spring stiffness in each round if the boundary starts at most one element off the surface.
-The unit of length is the median edge length."""
+"""The stiffness, in each smoothing round, of the springs that pull the boundary to the surface.
+The values apply if the boundary starts at most one element off the surface. The unit of length is
+the median edge length."""
 SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
-"""The spring stiffness in each round if the boundary starts on the surface."""
+"""The stiffness of these springs in each round if the boundary starts on the surface."""
 MIN_FINAL_RADIUS_RATIO = 0.15
 """The minimum radius ratio (a measure of quality) of an element after its corners are moved onto
 the surface."""

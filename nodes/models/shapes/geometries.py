@@ -101,7 +101,7 @@ def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
 
 
 def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
-    """Return the extent (m) of the lateral surface without the end caps."""
+    """Return how far (m) the lateral surface of a cylinder extends along a unit vector (3,)."""
     return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
 
 

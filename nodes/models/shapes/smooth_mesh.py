@@ -532,7 +532,7 @@ def _put(
     other: SurfaceProjections,
     chosen: Bools | slice = slice(None),
 ) -> None:
-    """Replace rows of the array fields of `feet` by rows of `other`, in place.
+    """Replace rows of the arrays in `feet` (surface projections) by rows of `other`, in place.
 
     rows: indices of the replaced rows.
     chosen: mask or slice that selects the rows of `other`.

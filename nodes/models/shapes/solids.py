@@ -184,7 +184,10 @@ class EllipsoidShape(Convex):
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate a quadratic function that is zero on the ellipsoid (a `LevelSet`)."""
+        """Evaluate a quadratic function of points (n, 3) that is zero on the ellipsoid.
+
+        The results are those of a `LevelSet`.
+        """
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
@@ -194,7 +197,11 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate the function of `_level` at one point with Python numbers (a `LevelAt`)."""
+        """Evaluate a quadratic function of one point (3,) that is zero on the ellipsoid.
+
+        Return its value, gradient and Hessian, and the support 1. Python numbers are used for
+        speed; `_level` evaluates the same function for arrays of points.
+        """
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
@@ -311,7 +318,7 @@ class RoundedBoxShape(Convex):
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,), m, of the core."""
+        """Return the half extents (3,), m, of the core, the box that the rounding surrounds."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(

@@ -31,7 +31,8 @@ class MeshError(FlexsheetError, ValueError):
 
     code = "mesh"
     remedy = (
-        "Repair the mesh: closed, outward, no inverted elements; see docs/soft-body-reference.md."
+        "Repair the mesh: it must be closed, with outward triangles and without inverted elements; "
+        "see docs/soft-body-reference.md."
     )
 
 
@@ -53,8 +54,8 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
         )
     if len(triangles) < 4:
         raise MeshError(
-            f"the mesh has {len(triangles)} triangles and cannot bound a solid, which has at least "
-            "4; complete the mesh"
+            f"the mesh has {len(triangles)} triangles, but a closed surface needs at least 4; "
+            "add the missing triangles"
         )
     if len(triangles) > MAX_TRIANGLES:
         raise MeshError(

@@ -101,7 +101,7 @@ def _check_depths(depths_m: Floats) -> Floats:
 def relative_position(
     rubber: Rubber, stretch_ratio: float, position_m: SheetPosition
 ) -> tuple[float, float]:
-    """Return (|x|, |y|) of a position (m), scaled to be 0 at the centre and 1 at the edge."""
+    """Return (|x|, |y|) of a sheet position (m), scaled to 0 at the centre and 1 at the edges."""
     half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
     return abs(position_m[0]) / half_width, abs(position_m[1]) / (0.5 * rubber.height_m)
 

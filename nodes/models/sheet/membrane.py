@@ -240,13 +240,13 @@ class _Grid:
         return self._assemble(local)
 
     def _assemble(self, local: Floats) -> Floats:
-        """Sum the forces (points, 4, 3), N, of integration points to forces (3 n,) at n nodes."""
+        """Assemble the nodal forces (3 n,), N, from forces (points, 4, 3) of integration points."""
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
     def _scatter(self, blocks: Floats) -> Floats:
-        """Sum the stiffnesses of integration points to entries of the sparse stiffness matrix."""
+        """Assemble the stiffness matrix's entries from the stiffnesses of integration points."""
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
@@ -375,7 +375,7 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _FingerContact:
-    """A penalty model of the contact of mesh nodes with the fingertip, except sticking nodes."""
+    """A penalty model of the contact between the fingertip and nodes that do not stick to it."""
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
         self.centre, self.radius, self.sticking = centre, radius_m, sticking
@@ -394,7 +394,7 @@ class _FingerContact:
         return 0.5 * float(self._penalty @ self._penetration(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the gradient (n, 3), N, and a positive semidefinite Hessian (n, 3, 3), N/m."""
+        """Return the energy's gradient (n, 3), N, and a semidefinite Hessian (n, 3, 3), N/m."""
         inside, outward = self._penetration(positions)
         stiff = np.where(inside > 0.0, self._penalty, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(

@@ -29,10 +29,11 @@ a position."""
 
 
 Curve = Callable[[Floats], Floats]
-"""A function of n depths (n,), m."""
+"""A function that returns ratios (n,), or their derivatives, at n depths (n,), m."""
 
 MAX_CURVES = 256
-"""The maximum number of stored curves. A planner needs some tens: all fits use the same pushes."""
+"""The maximum number of stored ratio curves. A planner needs some tens, because all of its fits use
+the same pushes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +95,14 @@ class TabulatedSheetModel:
         )
 
     def _ratios_of(self, push: SheetPush) -> Floats:
-        """Return the ratios (b,) for a push at the depths of the table."""
+        """Return the interpolated ratios (b,) for a push at the b depths of the table."""
         x, y = map(abs, push.position_m)
         ratios = _interpolate_linear(self.stretches, push.stretch_ratio, self.ratios)
         ratios = _interpolate_linear(self.xs_m, x, np.moveaxis(ratios, 1, 0))
         return _interpolate_linear(self.ys_m, y, np.moveaxis(ratios, 1, 0))
 
     def _ratio_curve(self, push: SheetPush) -> tuple[Curve, Curve]:
-        """Return the ratio as a function of the depth, and its derivative."""
+        """Return a push's ratio as a function of the depth, and the derivative of this function."""
         if push not in self._curves:
             if len(self._curves) >= MAX_CURVES:
                 self._curves.clear()
