@@ -360,5 +360,11 @@ def test_intervals_contain_the_truth_as_often_as_stated() -> None:
     assert 0.9 < np.mean([one.low <= 0.0 <= one.high for one in medians]) < 0.995
 
 
+def test_the_interval_of_a_median_is_symmetric() -> None:
+    few, many = estimate_median(range(7)), estimate_median(range(8))
+    assert (few.low, few.high) == (0.0, 6.0)
+    assert (many.low, many.high) == (1.0, 6.0)
+
+
 def test_json_never_holds_nan() -> None:
     assert replace_non_finite({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
