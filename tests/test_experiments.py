@@ -37,7 +37,7 @@ from flexsheet.messages.methods import (
     SoftBodyMethod,
     TrackingMethod,
 )
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, UnfitGeometryError
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import CpuPressure, HostStatus
 from flexsheet.nodes.methods import (
@@ -142,6 +142,20 @@ def make_recording(
         drops=0,
         **changes,
     )
+
+
+@pytest.mark.parametrize("command", ["stroke", "tilt", "push"])
+def test_a_scene_without_a_cylinder_is_refused_before_the_graph_starts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str
+) -> None:
+    def start(*_: object) -> None:
+        raise AssertionError("the graph starts")
+
+    monkeypatch.setattr("flexsheet.launch.experiments.run.precompute_graph", start)
+    options = ["--launch", "demo", "--scene", "plane", "--output", str(tmp_path)]
+    result = CliRunner().invoke(app, ["experiment", command, *options])
+    assert isinstance(result.exception, UnfitGeometryError)
+    assert 'is "plane", expected "cylinder"' in str(result.exception)
 
 
 def test_a_missing_stroke_is_named_with_what_there_is() -> None:
