@@ -228,7 +228,7 @@ class EtaEstimator:
         if now_s - self._start_s < CACHED_S:
             self._cached = done
         self._last = done
-        percent = f"{100 * done // total} %"
+        percent = f"{100 * done // max(total, 1)} %"
         if done in (self._cached, total):
             return percent
         left_s = (now_s - self._start_s) / (done - self._cached) * (total - done)

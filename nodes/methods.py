@@ -53,14 +53,18 @@ def estimate_rms(errors: NDArray[np.float64]) -> Interval:
 def estimate_median(values: Sequence[float]) -> Interval:
     """Estimate the median of values, with its confidence interval.
 
-    The limits of the interval are order statistics. If there are fewer than 6 values, the limits
+    The limits of the interval are order statistics. If there are fewer than 8 values, the limits
     are the minimum and the maximum.
 
     Source: Conover, Practical Nonparametric Statistics, 1999, section 3.2.
     """
     ordered, half = np.sort(values), 0.5 * len(values)
     margin = 0.5 * NORMAL_95 * np.sqrt(len(values))
-    low, high = max(0, int(half - margin)), min(len(values) - 1, int(np.ceil(half + margin)))
+    # Conover's ranks begin at 1.
+    low, high = (
+        min(max(int(np.ceil(rank)) - 1, 0), len(values) - 1)
+        for rank in (half - margin, half + margin)
+    )
     return Interval(float(np.median(ordered)), float(ordered[low]), float(ordered[high]))
 
 

@@ -37,7 +37,7 @@ from flexsheet.messages.methods import (
     SoftBodyMethod,
     TrackingMethod,
 )
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, UnfitGeometryError
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import CpuPressure, HostStatus
 from flexsheet.nodes.methods import (
@@ -142,6 +142,20 @@ def make_recording(
         drops=0,
         **changes,
     )
+
+
+@pytest.mark.parametrize("command", ["stroke", "tilt", "push"])
+def test_a_scene_without_a_cylinder_is_refused_before_the_graph_starts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str
+) -> None:
+    def start(*_: object) -> None:
+        raise AssertionError("the graph starts")
+
+    monkeypatch.setattr("flexsheet.launch.experiments.run.precompute_graph", start)
+    options = ["--launch", "demo", "--scene", "plane", "--output", str(tmp_path)]
+    result = CliRunner().invoke(app, ["experiment", command, *options])
+    assert isinstance(result.exception, UnfitGeometryError)
+    assert 'is "plane", expected "cylinder"' in str(result.exception)
 
 
 def test_a_missing_stroke_is_named_with_what_there_is() -> None:
@@ -358,6 +372,12 @@ def test_intervals_contain_the_truth_as_often_as_stated() -> None:
     medians = [estimate_median(random.standard_normal(30).tolist()) for _ in range(200)]
     assert 0.9 < np.mean([one.low <= 1.0 <= one.high for one in rms]) < 0.99
     assert 0.9 < np.mean([one.low <= 0.0 <= one.high for one in medians]) < 0.995
+
+
+def test_the_interval_of_a_median_is_symmetric() -> None:
+    few, many = estimate_median(range(7)), estimate_median(range(8))
+    assert (few.low, few.high) == (0.0, 6.0)
+    assert (many.low, many.high) == (1.0, 6.0)
 
 
 def test_json_never_holds_nan() -> None:

@@ -488,6 +488,7 @@ def test_a_strip_holds_what_faces_away(name: str) -> None:
         (SPHERE, {}, 0.02, "skin_spacing_m: 0.02"),
         (SPHERE, {}, float("nan"), "skin_spacing_m"),
         (SPHERE, {}, 0.0, "skin_spacing_m"),
+        (CYLINDER, {}, 0.012, "skin_spacing_m: 0.012 .* the radius of a cylinder"),
         (SPHERE, {}, 0.0003, "GiB"),
         (ELLIPSOID | {"semi_axes_m": [0.05, 0.05, 0.004]}, {}, 0.003, "minimum extent"),
         (BOX | {"size_m": [0.1, 0.1, 0.004], "edge_radius_m": 0.001}, {}, 0.003, "minimum extent"),

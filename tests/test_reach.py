@@ -112,6 +112,28 @@ def test_the_joints_hold_the_sheet_by_the_twins_arms(
         assert edge[:3, :3] == pytest.approx(wanted.world_from_sheet[:3, :3], abs=1e-9)
 
 
+def test_reach_and_paths_use_encoder_angles() -> None:
+    """Limits of joint ranges apply to encoder angles, and kinematics to corrected angles."""
+    offsets = np.array([0.05, -0.04, 0.03, 0.02, -0.06, 0.1])
+    values = SCENE.model_dump()
+    values["arms"]["left"]["joint_offsets_rad"] = offsets.tolist()
+    left = ArmGeometry(Scene.model_validate(values), "left")
+    wanted = sheet((0.01, 0.02, 0.0), (0.1, 0.0, 0.0))
+    plain = compute_reach(LEFT, RIGHT, places(wanted), FRONT)
+    offset = compute_reach(left, RIGHT, places(wanted), FRONT)
+    assert offset.joints_rad == pytest.approx(plain.joints_rad - offsets, abs=1e-9)
+    flange = compute_flange_poses(left, places(wanted))[0]
+    assert left.world_from_flange(offset.joints_rad[0]) == pytest.approx(flange, abs=1e-9)
+    assert offset.margins["wrist singularity"] == pytest.approx(plain.margins["wrist singularity"])
+    moved = offset.margins["J1 range"] - plain.margins["J1 range"]
+    assert abs(moved[0]) == pytest.approx(0.05, abs=1e-9)
+    joints = offset.joints_rad[0], find_best_reach(RIGHT, LEFT, places(wanted)).joints_rad[0]
+    goal = sheet((0.0, 0.0, 0.0))
+    path = plan_path(left, RIGHT, [wanted, goal], left_rad=joints[0], right_rad=joints[1])
+    end = left.world_from_flange(path[-1].left_rad)
+    assert end == pytest.approx(compute_flange_poses(left, places(goal))[0], abs=1e-9)
+
+
 @settings(max_examples=30)
 @given(near, near, lean, st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6))
 def test_speeds_are_those_of_the_jacobian(y: float, z: float, roll: float, twist: Any) -> None:

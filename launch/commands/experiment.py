@@ -168,6 +168,7 @@ def stroke(
         make_switch_procedure,
         run_experiment,
     )
+    from flexsheet.messages.scene import require_cylinder
 
     bag = make_result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
@@ -177,7 +178,14 @@ def stroke(
             given = [*given, "recorder.include=[stereo]"]
         omitted = without or ()
         run_experiment(
-            launch_file, given, bag, procedure, progress, apparatus=apparatus, without=omitted
+            launch_file,
+            given,
+            bag,
+            procedure,
+            progress,
+            apparatus=apparatus,
+            without=omitted,
+            check_scene=require_cylinder,
         )
         recording = experiment.read_recording(bag)
         errors = experiment.stroke_errors(recording, seconds)
@@ -370,6 +378,7 @@ def _measure_images(
         make_table_procedure,
         run_experiment,
     )
+    from flexsheet.messages.scene import require_cylinder
 
     mapped = map_file is not None
     with progress_words() as progress:
@@ -385,7 +394,14 @@ def _measure_images(
             procedure = chain_procedures(make_table_procedure(progress), procedure)
         needed = ["twin/eye"]
         run_experiment(
-            launch_file, settings, bag, procedure, progress, apparatus=apparatus, needed=needed
+            launch_file,
+            settings,
+            bag,
+            procedure,
+            progress,
+            apparatus=apparatus,
+            needed=needed,
+            check_scene=require_cylinder,
         )
         pictures = image.read_images(bag)
         rows = image.make_rows(pictures, series, with_maps=mapped, with_eyes=both_eyes)

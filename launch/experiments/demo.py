@@ -24,6 +24,7 @@ from flexsheet.launch.experiments.run import (
     run_experiment,
 )
 from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import require_cylinder
 from flexsheet.messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
@@ -81,7 +82,14 @@ def run_demo(
     coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     given = [*coarse, *settings]
     run_experiment(
-        launch_file, given, bag, procedure, progress, apparatus=apparatus, needed=["twin/eye"]
+        launch_file,
+        given,
+        bag,
+        procedure,
+        progress,
+        apparatus=apparatus,
+        needed=["twin/eye"],
+        check_scene=require_cylinder,
     )
 
 

@@ -116,10 +116,12 @@ def run_experiment(
     apparatus: str | None = None,
     needed: Collection[str] = (),
     without: Collection[Feature] = (),
+    check_scene: Callable[[Scene], object] = lambda scene: None,
 ) -> None:
     """Run a procedure on the graph of a launch file.
 
     bag: file to which all topics are recorded, or None if nothing is recorded.
+    check_scene: function that raises an error if the experiment does not support the scene.
     settings, apparatus, needed, without: arguments for `load_graph`.
     """
     plan = load_graph(
@@ -130,6 +132,7 @@ def run_experiment(
         needed=needed,
         without=without,
     )
+    check_scene(require_scene(plan))
     precompute_graph(plan, progress)
     try:
         asyncio.run(_await_interruptible(drive(plan, procedure, progress)))

@@ -33,7 +33,7 @@ from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import Methods
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.messages.types import Status, SuspectedCause
 from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 
@@ -69,7 +69,15 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
     settings = [*choose_ports(launch_file), *trial.get("settings", ())]
     with _bag_of(trial) as bag:
         procedure = make_stroke_procedure([seconds], _tell)
-        run_experiment(launch_file, settings, bag, procedure, _tell, apparatus=apparatus)
+        run_experiment(
+            launch_file,
+            settings,
+            bag,
+            procedure,
+            _tell,
+            apparatus=apparatus,
+            check_scene=require_cylinder,
+        )
         recording = stroke.read_recording(bag)
         errors = stroke.stroke_errors(recording, seconds)
         result = stroke.stroke_result(recording, errors, seconds, bag)

@@ -141,12 +141,10 @@ def _draw_errors(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:
             at = column + (number - 0.5 * (len(points) - 1)) * width
             height = ratio["value"]
             stages = point["budget"] if key == "sheet_mm" else {"": 1.0}
+            parts = np.maximum([*stages.values()], 0.0)
             bottom = 0.0
-            for shade, share in enumerate(max(one, 0.0) for one in stages.values()):
-                part = height * share / sum(max(one, 0.0) for one in stages.values())
-                axes.bar(
-                    at, part, 0.9 * width, bottom, color=colour, alpha=(0.9, 0.55, 0.25)[shade]
-                )
+            for shade, part in enumerate(height * parts / (parts.sum() or 1.0)):
+                axes.bar(at, part, 0.9 * width, bottom, color=colour, alpha=0.9 * 0.55**shade)
                 bottom += part
             interval = Interval(**ratio)
             bars = _bars(interval, height)

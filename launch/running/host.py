@@ -87,7 +87,7 @@ class HostAgent:
         self._plan, self._host, self._run, self._code = plan, host, run, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
         self._pids, self._cpu, self._starvation = pids, CpuWatch(), CpuWatch()
-        self._was_busy, self._busy_reported_ns = False, 0
+        self._busy_statuses, self._busy_reported_ns = 0, 0
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
         # Launchers repeat the e-stop, so a restarted launcher gets it from the other launchers.
@@ -296,10 +296,16 @@ class HostAgent:
             await asyncio.sleep(PERIOD_S)
 
     def _report_busy(self, status: HostStatus) -> None:
-        """Log that the processor became overloaded, at most once per BUSY_REPORT_PERIOD_S."""
-        busy, now_ns = is_busy(status), self._clock.now_ns()
-        began, self._was_busy = busy and not self._was_busy, busy
-        if began and now_ns >= self._busy_reported_ns + BUSY_REPORT_PERIOD_S * 1e9:
+        """Log that the processor became overloaded, at most once per BUSY_REPORT_PERIOD_S.
+
+        The second status in sequence is logged, because the first does not list the programs.
+        """
+        now_ns = self._clock.now_ns()
+        self._busy_statuses = self._busy_statuses + 1 if is_busy(status) else 0
+        if (
+            self._busy_statuses == 2
+            and now_ns >= self._busy_reported_ns + BUSY_REPORT_PERIOD_S * 1e9
+        ):
             self._busy_reported_ns = now_ns
             remedy = describe_busy_remedy(nice_denied=status.nice_denied)
             self._on_problem(f"{describe_busy(status)}; {remedy}")

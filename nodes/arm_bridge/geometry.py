@@ -52,6 +52,7 @@ class ArmGeometry:
 
     tool_points_flange: points (4, 3) m in the flange frame: the centre and both ends of the clamped
         edge, and the origin of the flange.
+    joint_offsets_rad: angles (6,) that are added to encoder angles before the kinematics.
     """
 
     def __init__(self, scene: Scene, side: Side) -> None:
@@ -67,7 +68,7 @@ class ArmGeometry:
         self.base_from_world = inverse(self.world_from_base)
         self.flange_from_edge = pose_matrix(arm.flange_from_edge)
         self.other_flange_from_edge = pose_matrix(other.flange_from_edge)
-        self._joint_offsets_rad = np.array(arm.joint_offsets_rad)
+        self.joint_offsets_rad = np.array(arm.joint_offsets_rad)
         self._compliance_m_per_n = arm.flange_compliance_m_per_n
         self._other_compliance_m_per_n = other.flange_compliance_m_per_n
         self.max_tool_speed = TOOL_SPEED_FRACTION * scene.arms.max_tool_speed_m_per_s
@@ -107,8 +108,9 @@ class ArmGeometry:
             compliance_m_per_n=self._compliance_m_per_n + self._other_compliance_m_per_n,
         )
 
-    def _base_from_flange(self, joints_rad: Floats) -> Floats:
-        return self._cached_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
+    def base_from_flange(self, joints_rad: Floats) -> Floats:
+        """Return the flange pose (4, 4) in the base frame at encoder angles (6,) rad."""
+        return self._cached_flange(tuple((joints_rad + self.joint_offsets_rad).tolist()))
 
     def _solve_flange(self, joints_rad: tuple[float, ...]) -> Floats:
         """Return the flange pose base_from_flange (4, 4), read-only because it is cached.
@@ -128,7 +130,7 @@ class ArmGeometry:
 
         joints_rad: joint angles (6,) that the encoders report.
         """
-        return self.world_from_base @ self._base_from_flange(joints_rad)
+        return self.world_from_base @ self.base_from_flange(joints_rad)
 
     def world_from_edge(self, joints_rad: Floats) -> Floats:
         """Return the world pose (4, 4) of the clamped edge at joint angles (6,) rad."""
@@ -136,7 +138,7 @@ class ArmGeometry:
 
     def tool_points(self, joints_rad: Floats) -> Floats:
         """Transform `tool_points_flange` (4, 3) m to the base frame at joint angles (6,) rad."""
-        return apply(self._base_from_flange(joints_rad), self.tool_points_flange)
+        return apply(self.base_from_flange(joints_rad), self.tool_points_flange)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
         """Return the joint angles (6,) rad that move this arm's edge to a pose of the sheet.
@@ -167,7 +169,7 @@ class ArmGeometry:
 
         The arm is assumed to be rigid. Raises UnreachableError if the arm cannot reach the pose.
         """
-        offsets_rad = self._joint_offsets_rad
+        offsets_rad = self.joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange
         joints_rad = self.kinematics.solve_next_joints(base_from_flange, near_rad + offsets_rad)
         return np.asarray(joints_rad - offsets_rad)

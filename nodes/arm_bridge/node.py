@@ -235,7 +235,7 @@ class ArmBridge(Node):
             status.currents_percent,
             geometry.flange_from_edge[:3, 3],
             towards / np.linalg.norm(towards),
-            forward=geometry.kinematics.forward,
+            forward=geometry.base_from_flange,
         )
         if force is not None:
             self.force.publish(force, source_ns=self._last.measured_ns)

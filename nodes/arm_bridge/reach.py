@@ -96,7 +96,7 @@ class SheetPoses:
 class ArmReach:
     """The joint angles and margins of one arm for n poses of the sheet on one branch.
 
-    joints_rad: joint angles (n, 6); NaN for poses that are out of reach.
+    joints_rad: encoder angles (n, 6); NaN for poses that are out of reach.
     margins: margins (n,) for each limit in `LIMITS`. Margins that depend on joint angles are NaN
         for poses that are out of reach. Margins are infinite for singularities that the arm does
         not have.
@@ -145,8 +145,12 @@ def compute_reach(
     other: geometry of the arm that holds the other edge.
     """
     flanges = compute_flange_poses(geometry, places)
-    joints = geometry.kinematics.solve_joints_on_branch(
-        geometry.base_from_world @ flanges, branch, geometry.start_rad
+    offsets_rad = geometry.joint_offsets_rad
+    joints = (
+        geometry.kinematics.solve_joints_on_branch(
+            geometry.base_from_world @ flanges, branch, geometry.start_rad + offsets_rad
+        )
+        - offsets_rad
     )
     others = compute_flange_poses(other, places)
     margins = _margins(geometry, joints=joints, flanges=flanges, others=others, places=places)
@@ -184,7 +188,7 @@ def _margins(
 ) -> dict[str, Floats]:
     """Return the margins (n,) of all limits for n poses of the sheet.
 
-    joints: joint angles (n, 6) rad.
+    joints: encoder angles (n, 6) rad.
     flanges, others: world poses (n, 4, 4) of this arm's flange and of the other arm's flange.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
@@ -204,7 +208,7 @@ def _margins(
         "reach": np.where(reachable, np.maximum(reach, 0.0), np.minimum(-np.abs(reach), -1e-9)),
         **{name: margin[:, joint] for joint, name in enumerate(RANGES)},
         **singular,
-        **geometry.kinematics.singularity_margins(joints),
+        **geometry.kinematics.singularity_margins(joints + geometry.joint_offsets_rad),
         "workspace": inside.min(axis=1),
         "flange distance": apart - limits.min_flange_distance_m,
         "edge force": limits.max_edge_force_n - force,
@@ -218,7 +222,7 @@ def _speeds(
 ) -> tuple[Floats, Floats]:
     """Return the maximum joint speeds (n, 6), rad/s, and tool speeds (n,), m/s, over all twists.
 
-    joints: joint angles (n, 6), rad.
+    joints: encoder angles (n, 6), rad.
     flanges: world poses (n, 4, 4) of the flange for n poses of the sheet.
     """
     fastest, tool = np.zeros_like(joints), np.zeros(len(joints))
@@ -226,7 +230,7 @@ def _speeds(
     points = _tool_points(geometry, flanges)
     fastest[~np.isfinite(joints)] = np.nan
     reachable = np.isfinite(joints).all(axis=1)
-    slopes = geometry.kinematics.jacobian(joints[reachable])
+    slopes = geometry.kinematics.jacobian(joints[reachable] + geometry.joint_offsets_rad)
     transposed = np.swapaxes(slopes, 1, 2)
     normal = transposed @ slopes + SPEED_DAMPING * np.eye(6)
     to_base = geometry.base_from_world[:3, :3].T
@@ -343,7 +347,8 @@ def _explain_jump(
     *,
     fraction: float,
 ) -> PathError:
-    reach = compute_reach(arm, other, _make_poses([there]), arm.kinematics.find_branch(before_rad))
+    branch = arm.kinematics.find_branch(before_rad + arm.joint_offsets_rad)
+    reach = compute_reach(arm, other, _make_poses([there]), branch)
     binding = int(reach.binding[0])
     limit = "jump" if binding < 0 else LIMITS[binding]
     why = (
@@ -436,7 +441,7 @@ def _check_limits(left: ArmGeometry, right: ArmGeometry, track: Sequence[PathSte
     )
     flanges = [compute_flange_poses(arm, places) for arm in (left, right)]
     for index, arm in enumerate((left, right)):
-        branch = arm.kinematics.find_branch(joints[index][0])
+        branch = arm.kinematics.find_branch(joints[index][0] + arm.joint_offsets_rad)
         own, other = flanges[index], flanges[1 - index]
         margins = _margins(arm, joints=joints[index], flanges=own, others=other, places=places)
         for margin in margins.values():

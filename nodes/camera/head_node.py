@@ -23,7 +23,7 @@ from flexsheet.nodes.camera.head_eyes import (
 )
 from flexsheet.nodes.camera.image_pair import DeviceError, Now, convert_to_gray
 from flexsheet.nodes.camera.live import open_capture
-from flexsheet.nodes.external_input import RejectedError, make_eye
+from flexsheet.nodes.external_input import RejectedError, Rejection, make_eye
 from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
@@ -158,10 +158,12 @@ class HeadCamera(Node):
             self._filter.reset()
         try:
             make_eye(centre, right, scene)  # An implausible position must not enter the filter.
-        except RejectedError:
+        except RejectedError as error:
             x, y, z = centre
-            where = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m, more than 1 m from the scene's eyes"
-            self._publish_invalid(at_ns, f"the eyes are {where}; check lens and world_from_camera")
+            far = error.reason is Rejection.OUTSIDE_RANGE
+            why = "more than 1 m from the scene's eyes" if far else "not finite"
+            where = f"the eyes are at ({x:.2f}, {y:.2f}, {z:.2f}) m, {why}"
+            self._publish_invalid(at_ns, f"{where}; check lens and world_from_camera")
             return
         filtered = self._filter.update(1e-9 * at_ns, np.concatenate([centre, right]))
         self._last_eye = make_eye(filtered[:3], filtered[3:], scene)

@@ -180,10 +180,12 @@ def estimate_node_count(spec: MeshSpec, shape: Shape) -> int:
     spacing, thickness = spec.skin_spacing_m, float((high - low).min())
     if isinstance(spec.geometry, Plane):
         thickness = min(thickness, spec.geometry.width_m, spec.geometry.height_m)
+    if isinstance(spec.geometry, Cylinder):
+        thickness = min(spec.geometry.radius_m, spec.geometry.length_m)
     if not 0.0 < spacing <= thickness / MIN_THICKNESS_SPACINGS * (1.0 + 1e-9):
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the object's "
-            f"minimum extent ({thickness:g} m); change skin_spacing_m"
+            f"minimum extent ({thickness:g} m, the radius of a cylinder); change skin_spacing_m"
         )
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
