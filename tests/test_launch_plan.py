@@ -334,6 +334,15 @@ def test_a_name_without_file_lists_the_shipped_files(tmp_path: Path) -> None:
     assert 'does not exist; did you mean "sphere"? Shipped scenes: box, ' in printed
 
 
+def test_a_launch_file_given_as_a_scene_is_one_error() -> None:
+    with pytest.raises(BadInputError) as caught:
+        load_scene(ROOT / "launch" / "demo.yaml")
+    text = str(caught.value)
+    assert "is a launch file, not a scene" in text
+    assert "scenes/cylinder.yaml" in text
+    assert len(text.splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "printed"),
     [

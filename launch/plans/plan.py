@@ -206,7 +206,16 @@ def load_scene(path: Path) -> Scene:
         raise BadInputError.single(
             str(path), (), "the file does not exist", name_shipped(path, SCENES)
         )
-    return make_scene(read_document(path))
+    document = read_document(path)
+    if "nodes" in document.values:
+        scene = document.values.get("scene")
+        raise BadInputError.single(
+            str(path),
+            (),
+            "the file is a launch file, not a scene",
+            f"give its scene: {scene}" if isinstance(scene, str) else "give a scene file",
+        )
+    return make_scene(document)
 
 
 def _make_node(
