@@ -56,7 +56,6 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState
-from tests.lab import Lab, missing
 from tests.lab_bags import Arm, Span, bags, measure_hold, read_arm, wanted
 
 SCENE_FILE = DEMO_FILE.parent / "scenes" / "cylinder.yaml"
@@ -181,6 +180,8 @@ def run_level(name: str, level: float, seconds: float, folder: Path) -> dict[str
 
 async def run_network_level(name: str, level: float, seconds: float) -> dict[str, Any]:
     """Run three simulated computers with disturbed arm cables, and evaluate the disturbed time."""
+    from tests.lab import Lab
+
     async with Lab() as lab:
         await lab.start_all()
         lab.stroke()
@@ -406,6 +407,8 @@ def select_levels(factor: Factor, *, quick: bool) -> tuple[float, ...]:
 
 
 def main() -> int:
+    from tests.lab import missing
+
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--output", type=Path, required=True, help="folder of all results")
     parser.add_argument("--factor", nargs="+", choices=list(FACTORS), default=list(FACTORS))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -113,6 +114,15 @@ def test_generated_tables_contain_nothing_of_the_machine() -> None:
         text = page.read_text()
         for wrong in ("<!-- include:", "PydanticUndefined", str(ROOT), str(Path.home()) + "/"):
             assert wrong not in text, f"{name(page)} contains {wrong}"
+
+
+def test_pages_need_no_development_packages() -> None:
+    """`make docs` works after `make setup`, which installs no packages for tests."""
+    program = (
+        "import sys; sys.modules.update(dict.fromkeys(('pytest', 'hypothesis', 'skfem')));"
+        "import website.pages"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
 
 
 def test_each_key_of_a_scene_file_has_a_described_effect() -> None:

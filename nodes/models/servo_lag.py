@@ -258,7 +258,7 @@ def _are_joints(joints_rad: Floats) -> bool:
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Update a mean (6,) and a total variance by a value (6,) with the weight `gain`."""
+    """Return a mean (6,) and a total variance, updated by a value (6,) of the weight `gain`."""
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square

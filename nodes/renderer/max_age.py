@@ -22,7 +22,7 @@ class MaxAge:
     """
 
     def __init__(self, given_s: float | None = None) -> None:
-        """Set a fixed maximum age (s), or derive it from the camera's period if it is None."""
+        """Set a fixed maximum age (s). If `given_s` is None, derive it from the camera's period."""
         self.seconds = MIN_AGE_S if given_s is None else given_s
         self._is_given = given_s is not None
         self._last: Header | None = None

@@ -25,8 +25,8 @@ class RendererParameters(NodeParameters):
     )
     monitor: str | int | None = Field(
         default=None,
-        description="Monitor of the projector, by name or number. null: an ordinary "
-        "window is used.",
+        description="Monitor of the projector, by name or number. null: an ordinary window is "
+        "used.",
     )
     swap_interval: int = Field(
         default=1,
@@ -38,14 +38,14 @@ class RendererParameters(NodeParameters):
     prediction_horizon_s: NonNegative = Field(
         default=0.016,
         description="Assumed time, s, from the start of drawing to the middle of the frame's "
-        "display. It is used until the first frame has been measured.",
+        "display. It is used until the latency of the first frame has been "
+        "measured.",
     )
     display_latency_s: NonNegative = Field(
         default=0.008,
-        description="Time, s, from the buffer swap "
-        "to the middle of the frame's display. This is half of "
-        "the time for which a frame is shown, plus the projector's delay. Without a window, the "
-        "time starts at the end of drawing.",
+        description="Time, s, from the buffer swap to the middle of the frame's display. This is "
+        "half of the time for which a frame is shown, plus the projector's delay. Without a "
+        "window, the time starts at the end of drawing.",
     )
     max_age_s: Positive | None = Field(
         default=None,
@@ -63,18 +63,18 @@ class RendererParameters(NodeParameters):
         ge=0,
         le=16,
         description="Number of samples per pixel (antialiasing). Fewer samples are faster without "
-        "a GPU. null: 4. For two_pass without a GPU, null means a higher resolution without "
-        "multisampling.",
+        "a GPU. null: 4 samples are used. For two_pass without a GPU, null means a higher "
+        "resolution without multisampling.",
     )
     correction: Correction | Literal["auto"] = Field(
         default="auto",
         description="Correction method until a display message sets it. auto: the method that the "
-        "scene specifies, or two_pass if the scene specifies none.",
+        "scene specifies is used, or two_pass if the scene specifies none.",
     )
     sheet_shape: SheetShapeMethod | Literal["auto"] = Field(
         default="auto",
         description="Method that computes the sheet's shape for two_pass. auto: the method that "
-        "the scene specifies, or reduced_order if the scene specifies none.",
+        "the scene specifies is used, or reduced_order if the scene specifies none.",
     )
     cache_dir: Path | None = Field(
         default=None,
