@@ -237,6 +237,72 @@ class NodeNote(Enum):
         "`flexsheet tune` choose `methods.soft_body`.",
     )
 
+    OSCILLATION_STOPPED = (
+        "of finger and sheet stopped",
+        "The note states how many times the planner has stopped the sheet's offset, because the "
+        "motion of the sheet drove an oscillation of the finger.",
+        "A single stop needs no action: the planner continues when the finger leaves the object. A "
+        "simulated finger that moves to and fro on a path can also cause it. If the number grows, "
+        "reduce the delay or use a stiffer object (docs/hand-in-the-loop.md).",
+    )
+    LOW_DAMPING = (
+        "a hand of low damping can oscillate",
+        "The planner cannot bound the sheet's offset so that it is stable for every hand, because "
+        "the sheet follows the finger too late.",
+        "Reduce the delay or use a stiffer object (docs/hand-in-the-loop.md). `flexsheet doctor "
+        "compliance` checks a scene at a given delay.",
+    )
+    OBJECT_TOO_STIFF = (
+        "stiffer than the sheet",
+        "The sheet cannot present the stiffness of the object, so the object feels too soft.",
+        "Use a softer object, or a sheet that is stiffer or stretches further. `flexsheet doctor "
+        "compliance` checks a scene.",
+    )
+    OBJECT_TOO_SOFT = (
+        "softer than the sheet",
+        "The sheet cannot present the stiffness of the object, so the object feels too stiff.",
+        "Use a stiffer object, or a sheet that is softer or larger. `flexsheet doctor compliance` "
+        "checks a scene.",
+    )
+    TOLERANCE_TOO_LARGE = (
+        "is too soft for the position tolerance",
+        "The object is so soft that the tolerated error of the sheet's position changes the force "
+        "noticeably.",
+        "Use a stiffer object, or set a smaller `tolerances.sheet_position_m` of the scene if the "
+        "apparatus is that accurate.",
+    )
+    MODEL_NOT_VALID = (
+        "is not valid here",
+        "The deepest push is outside the range in which the force model of the sheet is accurate.",
+        "Set a smaller `working_range.push_depth_m` of the scene, or choose another method "
+        "`sheet_force`.",
+    )
+    FORCE_TABLE_MISSING = (
+        "the table of the sheet's force is missing",
+        "The planner uses the less accurate scaled force model, because the cache does not contain "
+        "the table of this sheet.",
+        "Run `flexsheet precompute SCENE`, which takes 1 to 2 minutes. Then start the graph again.",
+    )
+    FORCE_MODEL = (
+        "sheet force model:",
+        "The note states which model of the sheet's force the planner uses.",
+        "No action is needed. The key `methods.sheet_force` of the scene chooses the model.",
+    )
+    FINGERTIPS_LATE = (
+        "late fingertips dropped",
+        "The note states how many fingertips the planner has ignored, because they were not newer "
+        "than the previous one.",
+        "No action is needed unless the number grows steadily. "
+        + BUSY_FIRST
+        + "Then check that only one node publishes `fingertip`: `flexsheet topic info fingertip`.",
+    )
+    FINGER_PATH_REFUSED = (
+        "refused path",
+        "The simulated finger cannot follow the newest path, and continues its previous motion.",
+        "Correct the path as the note states, and publish it again (`flexsheet topic pub "
+        "twin/finger_path`).",
+    )
+
     def __init__(self, phrase: str, meaning: str, remedy: str) -> None:
         self.phrase = phrase
         self.meaning = meaning
