@@ -27,7 +27,7 @@ def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
 
 
 def name_shipped(given: str | Path, shipped: Path) -> str:
-    """Return the remedy for a missing file: a text with the names of the shipped files.
+    """Return the hint for a file that does not exist: a text with the names of the shipped files.
 
     shipped: folder of the shipped files, which is LAUNCH_FILES or SCENES.
     """

@@ -81,7 +81,7 @@ class SoftBodyModel:
     """The precomputed elastic response of a soft body and its skin mesh.
 
     response: response to normal forces. triangles (t, 3): skin triangles with outward normals.
-    bounds (s,): true for each skin node that the finger must not touch, except on end faces. drag:
+    bounds (s,): true for each skin node that the finger must not touch; false on end faces. drag:
     response to tangential forces; None if the finger does not stick to the skin.
     """
 

@@ -112,7 +112,7 @@ class FilledNodes:
 
 
 def interpolate_nodes(job: FillJob) -> FilledNodes:
-    """Interpolate the snapshots of a job at each of its contact nodes."""
+    """Interpolate the solved pushes (snapshots) at each skin node of a job that can be touched."""
     interpolator = job.source.make_interpolator()
     moved, force, reached = zip(
         *(interpolator.interpolate(sample, job.rest) for sample in job.samples), strict=True

@@ -1,4 +1,7 @@
-"""Compute the sheet's offset from a filtered depth, for a stable control loop with the hand."""
+"""Compute the sheet's normal offset from the low-pass filtered depth of the fingertip.
+
+The filter keeps the closed loop of sheet and hand stable.
+"""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ class SheetTrajectoryPlanner:
 
     @property
     def watchdog_triggers(self) -> int:
-        """Return the number of oscillations that the watchdog has stopped."""
+        """Return the number of oscillations of the sheet that the oscillation watchdog stopped."""
         return self._offset.watchdog.triggers
 
     def _sag_m(self, sheet: SheetMotion, x_m: float, y_m: float) -> float:

@@ -65,8 +65,8 @@ class Grading:
     def sizes(self, points: Floats, normals: Floats, depth_m: Floats) -> Floats:
         """Return the required element sizes (n,), m, at points (n, 3), m, in the mesh frame.
 
-        For each of the n points, normals (n, 3) contains the unit normal of the nearest skin, and
-        depth_m (n,) contains the depth below this skin.
+        normals (n, 3): unit normals at the nearest points of the surface. depth_m (n,): depths
+        below these points.
         """
         if self.fine_point is not None:
             fine = self.fine_point
