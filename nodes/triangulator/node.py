@@ -228,7 +228,7 @@ class Triangulator(Node):
         return ProcessedPair(at_ns, reason, measured, found, detect_pair)
 
     def search_surroundings(self, processed: ProcessedPair) -> None:
-        """Search an image pair for clutter if the search period is over, and update the self-checks."""
+        """Search an image pair for clutter once per search period, and update the self-checks."""
         found = processed.detection
         if processed.reason == "ok" and self.association.is_clutter_search_due(processed.at_ns):
             found = processed.detect(gate=None)
