@@ -180,7 +180,7 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
         ("texture: image, image_file: huge.png", "2050x1 pixels, but at most 2048"),
         ("texture: grid, image_file: bad.png", "image_file requires `texture: image`"),
         ("texture: image, image_file: 7", "the value is not a file name"),
-        ("texture: image", "needs an image"),
+        ("texture: image", "requires an image"),
     ],
 )
 def test_a_file_that_is_no_texture_is_reported(

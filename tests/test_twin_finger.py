@@ -211,8 +211,8 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("text", "printed"),
     [
-        ("", "no column t_s"),
-        ("t_s,x_mm,y_mm\n0,1,2\n", "no column z_mm"),
+        ("", "not name the column t_s"),
+        ("t_s,x_mm,y_mm\n0,1,2\n", "not name the column z_mm"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,a,2,3\n", "line 3"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,nan,2,3\n", "line 3: a value is not finite"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n0,1,2,3\n", "line 3: t_s does not increase"),
