@@ -183,7 +183,11 @@ def test_seeds_are_parsed() -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("5-3", "3 is less than 5; give 3-5"), ("a-b", "expected A-B"), ("0-99999", "more than 10000 seeds")],
+    [
+        ("5-3", "3 is less than 5; give 3-5"),
+        ("a-b", "expected A-B"),
+        ("0-99999", "more than 10000"),
+    ],
 )
 def test_wrong_seeds_are_refused(text: str, message: str) -> None:
     with pytest.raises(ExperimentError, match=message):
