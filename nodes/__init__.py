@@ -7,9 +7,11 @@ that a process does not load the libraries of other nodes.
 
 from __future__ import annotations
 
+import os
 from difflib import get_close_matches
 from enum import StrEnum
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexsheet.messages.errors import FlexsheetError
@@ -113,21 +115,54 @@ def node_class(name: str) -> type[Node]:
         hint += '; name a node of your own as "module:Class"'
         raise UnknownNodeError(f'unknown node type "{name}"{hint}')
     try:
+        module = import_module(module_name)
+    except (Exception, SystemExit) as error:  # the module can raise anything
+        problem, advice = _describe_import_error(module_name, error)
+        raise NodeImportError(name, problem, advice) from error
+    try:
         # The module is known only at run time, so the type of the class is not.
-        return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]
-    except (ImportError, AttributeError, SyntaxError) as error:
-        advice = _describe_import_advice(module_name, class_name, error)
+        return getattr(module, class_name)  # type: ignore[no-any-return]
+    except AttributeError as error:
+        advice = f"define the class {class_name} in {module_name}, or correct its name"
         raise NodeImportError(name, str(error), advice) from error
 
 
-def _describe_import_advice(module: str, class_name: str, error: Exception) -> str:
-    if isinstance(error, ModuleNotFoundError) and error.name:
-        if module == error.name or module.startswith(f"{error.name}."):
-            return (
-                "write PYTHONPATH=FOLDER before the command, where FOLDER contains "
-                f"{module.replace('.', '/')}.py, or install the package"
-            )
-        return f"install the module {error.name}: pip install {error.name.partition('.')[0]}"
-    if isinstance(error, AttributeError):
-        return f"define the class {class_name} in {module}, or correct its name"
-    return f"correct the module {module}"
+def _describe_import_error(module: str, error: BaseException) -> tuple[str, str]:
+    """Return the location and the text of an error during an import, and an advice."""
+    missing = error.name if isinstance(error, ModuleNotFoundError) else None
+    if missing and (module == missing or module.startswith(f"{missing}.")):
+        return str(error), (
+            "write PYTHONPATH=FOLDER before the command, where FOLDER contains "
+            f"{module.replace('.', '/')}.py, or install the package"
+        )
+    text = error.msg if isinstance(error, SyntaxError) else str(error)
+    problem = f"{_locate_error(module, error)}: {type(error).__name__}: {text}"
+    if missing:
+        return problem, f"install the module {missing}: pip install {missing.partition('.')[0]}"
+    return problem, f"correct the module {module}"
+
+
+def _locate_error(module: str, error: BaseException) -> str:
+    """Return "file:line" of an error during the import of a module, or the name of the module.
+
+    If a library raises the error, this is the line that calls the library.
+    """
+    import traceback  # imported here, because it is slow and only needed after an error
+    from sysconfig import get_paths
+
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{error.filename}:{error.lineno}"
+    kinds = ("stdlib", "platstdlib", "purelib", "platlib")
+    folders = (*map(get_paths().get, kinds), Path(__file__).parents[1])
+    libraries = tuple(f"{folder}{os.sep}" for folder in folders)
+    # The first two frames are `node_class` and `import_module`.
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)[2:]
+        if not frame.filename.startswith("<")
+    ]
+    own = [frame for frame in frames if not frame.filename.startswith(libraries)]
+    if not frames:
+        return module
+    last = (own or frames)[-1]
+    return f"{last.filename}:{last.lineno}"

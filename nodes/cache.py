@@ -15,11 +15,14 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 import structlog
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from flexsheet.messages.scene import Scene
 
 Arrays = Mapping[str, NDArray[Any]]
 T = TypeVar("T")
@@ -37,6 +40,15 @@ def default_cache_dir() -> Path:
     """Return the user's cache directory: $XDG_CACHE_HOME/flexsheet, or ~/.cache/flexsheet."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "flexsheet"
+
+
+def advise_precompute(scene: Scene, options: str = "") -> str:
+    """Return the advice to compute the missing tables of a scene, for the note of a node.
+
+    options: options of the command, which start with a space.
+    """
+    command = f"flexsheet precompute SCENE{options}"
+    return f'with the file of the scene "{scene.name}" as SCENE, run {command}'
 
 
 def make_digest(value: object) -> str:

@@ -144,6 +144,16 @@ def test_a_bridge_that_hangs_is_stopped_when_it_resumes(graph: Graph) -> None:
     wait_until(lambda: stop_by_command()[1]["arms"][0]["mode"] == "estop", "it to stop")
 
 
+def test_the_arms_of_each_of_several_graphs_are_reported(graph: Graph) -> None:
+    other = runs.create_run()
+    other.plan_file.write_text('{"launch_file": "own.yaml", "nodes": {}}')
+    code, answer = stop_by_command()
+    assert (code, answer["stopped"]) == (1, False), "nothing confirms the stop of the other graph"
+    assert ("launcher", "launch", "confirmed") in outcomes(answer)
+    modes = {(arm["run"], arm["mode"]) for arm in answer["arms"]}
+    assert modes == {(str(graph.run.directory), "estop"), (str(other.directory), "silent")}
+
+
 def test_without_a_graph_there_is_nothing_to_stop() -> None:
     done = subprocess.run([*FLEXSHEET, "arms", "stop"], capture_output=True, text=True, check=False)
     assert done.returncode == 1
@@ -251,6 +261,39 @@ def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path
     finally:
         bridge.kill()
         bridge.communicate()
+
+
+def test_the_answer_of_one_graph_spares_no_bridge_of_another(tmp_path: Path) -> None:
+    """Each graph is stopped as if it were the only one."""
+    answering, hanging = tmp_path / "a", tmp_path / "b"
+    answering.mkdir()
+    hanging.mkdir()
+    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); "
+    code += "s.bind(sys.argv[1]); s.listen(); print(flush=True); "
+    answer = f"c, _ = s.accept(); c.recv(1000); c.send({stop_socket.ANSWER!r}); "
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", code + more + "time.sleep(1000)", str(file)],
+            stdout=subprocess.PIPE,
+        )
+        for more, file in (
+            (answer, answering / "launch.launcher.stop"),
+            ("", hanging / "bridge.node.stop"),
+        )
+    ]
+    try:
+        for process in started:
+            assert process.stdout is not None
+            process.stdout.readline()
+        attempts = stop_arms([answering, hanging], REASON)
+        assert {(one.run, one.receiver, one.outcome) for one in attempts} == {
+            (answering, "launch", StopOutcome.CONFIRMED),
+            (hanging, "bridge", StopOutcome.KILLED),
+        }
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()
 
 
 @pytest.mark.parametrize("process", ["planner", "tracking"])

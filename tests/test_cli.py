@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -197,6 +198,41 @@ def test_node_types_and_info(flexsheet: Command) -> None:
     assert 'did you mean "planner"?' in printed.err
 
 
+@pytest.mark.parametrize(
+    ("text", "line", "printed"),
+    [
+        ("import json\nx = undefined\n", 2, "NameError: name 'undefined' is not defined"),
+        ("import json\n\njson.loads('{')\n", 3, "JSONDecodeError: Expecting property name"),
+        ("\ndef f(:\n", 2, "SyntaxError: invalid syntax"),
+        ("import no_such\n", 1, "ModuleNotFoundError: No module named 'no_such'; install"),
+        ("import sys\nsys.exit(3)\n", 2, "SystemExit: 3"),
+    ],
+    ids=("name", "library", "syntax", "missing", "exit"),
+)
+def test_an_error_in_the_module_of_a_node_names_its_line(
+    *,
+    flexsheet: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    text: str,
+    line: int,
+    printed: str,
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path / "runs"))
+    module = tmp_path / "node_with_error.py"
+    module.write_text(text)
+    monkeypatch.delitem(sys.modules, module.stem, raising=False)
+    importlib.invalidate_caches()
+    expected = f'"{module.stem}:Mine" cannot be imported: {module}:{line}: {printed}'
+    graph = write(tmp_path, {"nodes": {"mine": {"type": f"{module.stem}:Mine"}}})
+    for arguments in (("node", "info", f"{module.stem}:Mine"), ("launch", graph, "--dry-run")):
+        result = flexsheet(*arguments)
+        assert result.code == 2
+        assert expected in result.err
+        assert "Traceback" not in result.err
+
+
 def test_dry_run_prints_the_plan_and_starts_nothing(
     flexsheet: Command, tmp_path: Path, runs_root: Path
 ) -> None:
@@ -361,6 +397,49 @@ def test_status_shows_rates_of_all_nodes(flexsheet: Command, running: Path) -> N
     assert "status " not in shown
 
 
+def test_status_states_which_of_several_graphs_it_shows(flexsheet: Command, running: Path) -> None:
+    shown = runs.list_live_runs()[0]
+    other = runs.create_run()
+    try:
+        printed = flexsheet("status")
+        as_json = flexsheet("status", "--json").json()
+    finally:
+        shutil.rmtree(other.directory)
+    assert printed.err.startswith("2 graphs are running; this is ")
+    assert f"graph.yaml, run {shown.directory}" in printed.err.splitlines()[0]
+    assert f"to show starting: flexsheet status --run {other.directory}" in printed.err
+    assert set(as_json["running"]) == {str(shown.directory), str(other.directory)}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("stop",),
+        ("param", "set", "planner.max_age_s", "0.1"),
+        ("topic", "pub", "display", "{correction: none, stereo: mono}"),
+        ("arms", "enable"),
+        ("arms", "disable"),
+        ("arms", "reset"),
+    ],
+    ids=" ".join,
+)
+def test_a_command_does_not_choose_which_of_several_graphs_it_changes(
+    flexsheet: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...],
+) -> None:
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("a graph was stopped"))
+    made = [runs.create_run() for _ in range(2)]
+    made[0].plan_file.write_text(json.dumps({"launch_file": "own.yaml"}))
+    printed = flexsheet(*arguments)
+    assert printed.code == 2
+    assert "2 graphs are running, so --run is required; choose one:" in printed.err
+    assert f"--run {made[0].directory} (own.yaml)" in printed.err
+    assert f"--run {made[1].directory} (starting)" in printed.err
+
+
 def test_status_distinguishes_skipped_from_lost_messages() -> None:
     port = PortStatus(
         topic="frame", rate_hz=25.0, age_s=None, messages=9, dropped=4, gaps=2, rejected=1
@@ -422,6 +501,9 @@ def test_logs_print_the_log_of_a_node(flexsheet: Command, running: Path) -> None
     printed = flexsheet("logs", "silent")
     assert (printed.code, printed.out) == (0, "")
     assert printed.err == "the log of silent has no entries\n"
+    listed = flexsheet("logs", "--json").json()
+    assert {"node": "recorder"} in listed
+    assert {"node": "beacon"} in listed
     printed = flexsheet("logs", "recordr")
     assert (printed.code, 'did you mean "recorder"?' in printed.err) == (2, True)
 
@@ -459,7 +541,11 @@ def test_parameters_of_a_node_that_cannot_be_imported_here_are_listed(
     ("arguments", "code", "printed"),
     [
         (("set", "beacon.rate_hz", "9"), 2, "start the graph again with --set beacon.rate_hz=9"),
-        (("set", "listener.patience_s", "soon"), 2, "listener.patience_s=soon: invalid value"),
+        (
+            ("set", "listener.patience_s", "soon"),
+            2,
+            "listener.patience_s: 'soon' is invalid; write a number in s, without the unit",
+        ),
         (("set", "listener.patience", "1"), 2, 'did you mean "patience_s"?'),
         (("get", "listner.patience_s"), 2, 'did you mean "listener"?'),
     ],

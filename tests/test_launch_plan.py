@@ -343,6 +343,17 @@ def test_a_launch_file_given_as_a_scene_is_one_error() -> None:
     assert len(text.splitlines()) == 1
 
 
+@pytest.mark.parametrize("option", ["scene=graph.yaml", "scene=own.yaml"])
+def test_a_launch_file_given_as_the_scene_of_another_is_one_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.yaml").write_text("extends: demo\n")
+    errors = complaint(tmp_path, "extends: demo\nnodes: {}\n", settings=[option])
+    assert "is a launch file, not a scene; give " in errors
+    assert len(errors.splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "printed"),
     [

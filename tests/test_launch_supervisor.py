@@ -148,8 +148,24 @@ def test_a_used_port_names_the_options_of_both_nodes() -> None:
         with pytest.raises(BadInputError) as error:
             supervisor._check_ports(plan, None)
     options = "--set twin_arms.left_port=PORT --set arm_left_bridge.port=PORT"
-    assert f"port {port} of 127.0.0.1, for twin_arms, is in use" in str(error.value)
+    assert f"port {port} of 127.0.0.1, for twin_arms, is in use; stop the other" in str(error.value)
     assert options in str(error.value)
+
+
+def test_a_port_used_by_a_running_graph_names_the_graph(runs_root: Path) -> None:
+    """An option of the command that sets the port replaces --set."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        settings = [f"console.page_port={taken.getsockname()[1]}"]
+        plan = load_graph(ROOT / "launch" / "demo.yaml", settings=settings, console=True)
+        starting, run = runs.create_run(), runs.create_run()
+        run.plan_file.write_text(plan.model_dump_json())
+        with pytest.raises(BadInputError) as error:
+            supervisor._check_ports(plan, None, {"console.page_port": "--port PORT"})
+    assert starting.is_alive()
+    text = str(error.value)
+    assert f"in use by the running graph of {plan.launch_file}; " in text
+    assert f"stop it: flexsheet stop --run {run.directory}, or choose another port: --p" in text
+    assert "--set" not in text
 
 
 async def test_real_time_is_withdrawn_if_another_node_gets_no_processor(

@@ -174,7 +174,8 @@ def test_without_indentation_shapes_four_triangles_are_used_and_reported(
     tip = np.array([0.0, 0.0, -0.02])
     picture = drawn(bare, "two_pass", sheet_at(np.eye(4), tip))
     assert picture.max() == 255
-    assert bare.note == NO_SHAPES_NOTE
+    assert bare.note.startswith(NO_SHAPES_NOTE)
+    assert f'the scene "{SCENE.name}" as SCENE, run flexsheet precompute SCENE' in bare.note
 
 
 @pytest.mark.parametrize("tilt_deg", [88.5, 91.0])

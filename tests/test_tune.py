@@ -514,6 +514,7 @@ def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path:
         method, spacing_m = choose_method(table, "auto", by_hand_m)
         printed = SoftBodyFactory(spacing_m, tmp_path).pending_note(table, method, [])
         assert printed.endswith(f"--skin-spacing {effective}")
+        assert f'the scene "{table.name}" as SCENE' in printed
         dragging = SoftBodyFactory(spacing_m, tmp_path, friction_ratio=0.3)
         assert dragging.pending_note(table, method, []) == "", "there never is a table"
     assert SoftBodyFactory(0.006, tmp_path).pending_note(linear, "auto", []) == ""
@@ -527,7 +528,7 @@ def test_a_missing_force_table_is_replaced_and_reported(tmp_path: Path) -> None:
     scene = SCENE.model_copy(update={"sheet": sheet})
     law, reported = load_force_model(scene, "table", tmp_path)
     assert law.name == "scaled"
-    assert "flexsheet precompute" in reported
+    assert f'the scene "{scene.name}" as SCENE, run flexsheet precompute SCENE' in reported
     assert load_force_model(scene, "scaled", tmp_path) == (law, "scaled")
 
 

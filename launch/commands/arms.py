@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from flexsheet.launch.commands.graph import run_interruptible, running_graph
-from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
+from flexsheet.launch.commands.graph import choose_run, run_interruptible, running_graph
+from flexsheet.launch.commands.options import (
+    ChangedRunOption,
+    JsonOption,
+    RunOption,
+    StoppedRunOption,
+    make_app,
+)
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
@@ -53,7 +60,7 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
 
 
 @app.command(epilog=examples("flexsheet arms enable"))
-def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
+def enable(run: ChangedRunOption = None, as_json: JsonOption = False) -> None:
     """Allow the arms to move; first make sure that nobody is near them.
 
     If an arm refuses, its reason is printed and the exit code is 1.
@@ -63,11 +70,13 @@ def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and all(arm.ready for arm in arms.values())
 
-    raise typer.Exit(_command(run, ("arming", Arming(ready=True)), done, as_json))
+    raise typer.Exit(_command(choose_run(run), ("arming", Arming(ready=True)), done, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms disable --reason 'end of the session'"))
-def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False) -> None:
+def disable(
+    reason: ReasonOption = "", run: ChangedRunOption = None, as_json: JsonOption = False
+) -> None:
     """Stop both arms and slacken the sheet until you run `flexsheet arms enable`."""
     from flexsheet.messages.types import Arming
 
@@ -75,12 +84,14 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
         return len(arms) == 2 and not any(arm.ready for arm in arms.values())
 
     command = ("arming", Arming(ready=False, reason=reason))
-    raise typer.Exit(_command(run, command, done, as_json))
+    raise typer.Exit(_command(choose_run(run), command, done, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms stop"))
 def stop(
-    reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
+    reason: ReasonOption = "flexsheet arms stop",
+    run: StoppedRunOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Engage the software emergency stop (e-stop) of the arms.
 
@@ -88,8 +99,8 @@ def stop(
     the hard-wired e-stop. Without --run, it stops the arms of all graphs of this user on this
     computer.
 
-    The exit code is 0 if the stop is confirmed by a launcher or by a node that controls an arm. It
-    is also 0 if both arms report the stop.
+    The exit code is 0 if the stop of each graph is confirmed by its launcher or by a node that
+    controls an arm. It is also 0 if both arms report the stop.
     """
     from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms
@@ -98,48 +109,104 @@ def stop(
         attempts = sent_early.pop()
     else:
         attempts = stop_arms([run] if run else [one.directory for one in list_live_runs()], reason)
-    raise typer.Exit(run_interruptible(_confirm_stop(run, reason, attempts, as_json)))
+    raise typer.Exit(run_interruptible(_confirm_stops(run, reason, attempts, as_json)))
+
+
+@dataclass(frozen=True, slots=True)
+class _StopResult:
+    """The attempts to stop the arms of one run, and the states of its arms."""
+
+    run: Run
+    attempts: list[StopAttempt]
+    arms: dict[str, ArmState]
+    problems: list[str]
+
+    @property
+    def shown(self) -> bool:
+        """Return whether both arms report the stop."""
+        return _are_stopped(self.arms)
+
+    @property
+    def confirmed(self) -> bool:
+        return self.shown or any(one.worked for one in self.attempts)
+
+
+def _are_stopped(arms: dict[str, ArmState]) -> bool:
+    return len(arms) == 2 and all(arm.mode == "estop" for arm in arms.values())
+
+
+async def _confirm_stops(
+    run_directory: Path | None, reason: str, attempts: list[StopAttempt], as_json: bool
+) -> int:
+    """Print the results of the stop attempts and the states of the arms; return the exit code."""
+    from flexsheet.launch.running.runs import list_live_runs
+    from flexsheet.launch.running.stopping import StopOutcome
+
+    ready = [one.directory for one in list_live_runs() if one.plan_file.is_file()]
+    # Without a running graph, `running_graph` raises the error.
+    chosen = [run_directory] if run_directory is not None or not ready else ready
+    results = await asyncio.gather(
+        *(
+            _confirm_stop(
+                directory,
+                reason,
+                [one for one in attempts if len(chosen) == 1 or one.run == directory],
+            )
+            for directory in chosen
+        )
+    )
+    _show_stop(results, as_json)
+    for result in results:
+        where = "" if len(results) == 1 else f" of {result.run.directory}"
+        for text in result.problems:
+            words.print(text)
+        if not result.shown:
+            silent = [side for side, state in result.arms.items() if state.mode != "estop"]
+            silent += [side for side in SIDES if side not in result.arms]
+            words.print(
+                f"[red]not confirmed by the arms{where}[/]: {', '.join(silent)}", markup=True
+            )
+        if any(one.outcome is StopOutcome.REFUSED for one in result.attempts):
+            words.print(
+                f"the stop was not published on the topic estop{where}, because another tool is "
+                "writing it"
+            )
+    return 0 if all(one.confirmed for one in results) else FAILED
 
 
 async def _confirm_stop(
-    run_directory: Path | None, reason: str, attempts: list[StopAttempt], as_json: bool
-) -> int:
-    """Print the results of the stop attempts and the states of the arms; return the exit code.
+    run_directory: Path | None, reason: str, attempts: list[StopAttempt]
+) -> _StopResult:
+    """Wait until both arms of a graph report the stop, and return the result.
 
-    If no launcher has confirmed a stop, an e-stop is published on the topic `estop`.
+    If the graph's launcher has not confirmed a stop, an e-stop is published on the topic `estop`.
     """
-    from flexsheet.launch.running.stopping import StopOutcome, StopPath
+    from pydantic import ValidationError
+
+    from flexsheet.launch.running.runs import Run
+    from flexsheet.launch.running.stopping import StopPath
     from flexsheet.messages.types import EStop
 
-    plan, run = running_graph(run_directory)
+    try:
+        plan, run = running_graph(run_directory)
+    except ValidationError:
+        assert run_directory is not None
+        text = (
+            f"another version of flexsheet runs {run_directory}; check its arms with that version"
+        )
+        return _StopResult(Run(run_directory.name, run_directory), attempts, {}, [text])
     latched = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
     async with _Arms(plan, run) as arms:
         if not latched:
             attempts = [*attempts, await arms.publish_stop(EStop(engaged=True, reason=reason))]
-
-        def stopped(states: dict[str, ArmState]) -> bool:
-            return len(states) == 2 and all(arm.mode == "estop" for arm in states.values())
-
-        shown = await arms.wait_for(stopped)
-    confirmed = shown or any(one.worked for one in attempts)
-    _show_stop(arms.states, attempts, confirmed, as_json)
-    for text in arms.problems:
-        words.print(text)
-    if not shown:
-        silent = [side for side, state in arms.states.items() if state.mode != "estop"]
-        silent += [side for side in SIDES if side not in arms.states]
-        words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}", markup=True)
-    if any(one.outcome is StopOutcome.REFUSED for one in attempts):
-        words.print(
-            "the stop was not published on the topic estop, because another tool is writing it"
-        )
-    return 0 if confirmed else FAILED
+        await arms.wait_for(_are_stopped)
+    return _StopResult(run, attempts, arms.states, arms.problems)
 
 
 @app.command(epilog=examples("flexsheet arms reset --reason 'inspected, all clear'"))
 def reset(
     reason: ReasonOption = "flexsheet arms reset",
-    run: RunOption = None,
+    run: ChangedRunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Reset the e-stop and the stored faults of arms that are at rest.
@@ -151,6 +218,7 @@ def reset(
     from flexsheet.launch.running.tools import tools_host
     from flexsheet.messages.types import EStop
 
+    run = choose_run(run)
     plan, found = running_graph(run)
     host = tools_host(found)
     if tools_on(host) not in plan.may_reset_estop():
@@ -247,7 +315,8 @@ class _Arms:
             await asyncio.sleep(READER_RECONNECT_S)
         except BusError:
             outcome = StopOutcome.REFUSED
-        return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
+        after_ms = 1e3 * (self._loop.time() - begun_s)
+        return StopAttempt(self._run.directory, StopPath.TOPIC, "estop", outcome, after_ms)
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
         """Wait until `done` returns True for the recent states of the arms.
@@ -310,21 +379,31 @@ def _rows(arms: dict[str, ArmState]) -> list[dict[str, Any]]:
     ]
 
 
-def _show_stop(
-    arms: dict[str, ArmState], attempts: list[StopAttempt], stopped: bool, as_json: bool
-) -> None:
+def _show_stop(results: list[_StopResult], as_json: bool) -> None:
+    """Print the stop attempts and the states of the arms.
+
+    If there are several runs, each row names its run.
+    """
+
+    def name_run(result: _StopResult) -> dict[str, Any]:
+        return {} if len(results) == 1 else {"run": str(result.run.directory)}
+
     paths = [
         {
+            **name_run(result),
             "path": one.path.value,
             "receiver": one.receiver,
             "outcome": one.outcome.value,
             "after_ms": round(one.after_ms, 1),
         }
-        for one in attempts
+        for result in results
+        for one in result.attempts
     ]
+    arms = [{**name_run(result), **row} for result in results for row in _rows(result.arms)]
     if as_json:
-        print_json({"stopped": stopped, "paths": paths, "arms": _rows(arms)})
+        stopped = all(result.confirmed for result in results)
+        print_json({"stopped": stopped, "paths": paths, "arms": arms})
         return
     print_rows(paths, as_json=False)
     print()
-    print_rows(_rows(arms), as_json=False)
+    print_rows(arms, as_json=False)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexsheet.launch.commands.output import FAILED, CommandError, words
+from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError, words
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
@@ -28,6 +28,40 @@ class NoGraphError(CommandError):
 
     def __init__(self, text: str) -> None:
         super().__init__(text, FAILED)
+
+
+class SeveralGraphsError(CommandError):
+    """Raised if several graphs are running, and a command does not state which one it changes."""
+
+    code = "several-graphs"
+    remedy = "Add --run with the run directory of the graph: `flexsheet stop --run FOLDER`."
+    phrase = "graphs are running, so --run is required"
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        choices = "".join(f"\n  --run {one.directory} ({describe_launch(one)})" for one in runs)
+        super().__init__(f"{len(runs)} {self.phrase}; choose one:{choices}", BAD_INPUT)
+
+
+def describe_launch(run: Run) -> str:
+    """Return the launch file of a run, or "starting" if the run has no plan yet."""
+    return run.launch_file or "starting"
+
+
+def choose_run(directory: Path | None) -> Path | None:
+    """Return the run directory of the graph that a command changes, or None if no graph is running.
+
+    directory: value of the option --run.
+
+    Raises SeveralGraphsError if `directory` is None and several graphs of this user are running.
+    """
+    from flexsheet.launch.running.runs import list_live_runs
+
+    if directory is not None:
+        return directory
+    live = list_live_runs()
+    if len(live) > 1:
+        raise SeveralGraphsError(live)
+    return None
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:

@@ -120,15 +120,28 @@ TwinApparatusOption = Annotated[
         "`calibrate arms` and `calibrate projector` add random deviations (see --seed).",
     ),
 ]
-RunOption = Annotated[
-    Path | None,
-    typer.Option(
+
+
+def _run_option(default: str) -> Any:
+    """Return the option --run.
+
+    default: text that states which graph is used without the option.
+    """
+    return typer.Option(
         "--run",
         metavar="FOLDER",
-        help="Run directory of the graph; default: the newest running graph.",
+        help=f"Run directory of the graph; {default}.",
         autocompletion=complete.runs,
-    ),
-]
+    )
+
+
+RunOption = Annotated[Path | None, _run_option("default: the newest running graph")]
+ChangedRunOption = Annotated[Path | None, _run_option("required if several graphs are running")]
+StoppedRunOption = Annotated[Path | None, _run_option("default: all graphs of this user")]
+"""The option --run of a command that stops the arms of all graphs.
+
+RunOption is that of a command that reads a graph, ChangedRunOption that of one that changes it.
+"""
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 DurationOption = Annotated[
     float | None,

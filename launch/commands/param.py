@@ -11,12 +11,13 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import (
+    choose_run,
     find_node,
     receive_until,
     run_interruptible,
     running_graph,
 )
-from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
+from flexsheet.launch.commands.options import ChangedRunOption, JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
@@ -108,7 +109,7 @@ def get_parameter(
 def set_parameter(
     parameter: ParameterArgument,
     value: Annotated[str, typer.Argument(help="New value, in YAML syntax.")],
-    run: RunOption = None,
+    run: ChangedRunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Change a parameter of a running node; the change is lost when the node restarts.
@@ -118,11 +119,11 @@ def set_parameter(
     from pydantic import ValidationError
     from ruamel.yaml.error import YAMLError
 
-    from flexsheet.launch.plans.documents import parse_value
+    from flexsheet.launch.plans.documents import describe_value_error, parse_value
     from flexsheet.nodes import node_class
     from flexsheet.nodes.node import find_parameters_type
 
-    plan, found = running_graph(run)
+    plan, found = running_graph(choose_run(run))
     node, name = _find_parameter(plan, parameter)
     names = node_class(node.type).live_parameters
     if name not in names:
@@ -138,8 +139,8 @@ def set_parameter(
     except YAMLError as error:
         raise CommandError(f"VALUE {value}: not a valid YAML value: {error}") from error
     except ValidationError as error:
-        text = "; ".join(one["msg"] for one in error.errors())
-        raise CommandError(f"{parameter}={value}: invalid value: {text}") from error
+        texts = ("; ".join(describe_value_error(one, name)) for one in error.errors())
+        raise CommandError(f"{parameter}: {', '.join(texts)}") from error
     new = checked.model_dump(mode="json")[name]
     run_interruptible(_set(plan, found, node.name, name, new))
     result = {"parameter": parameter, "value": new}

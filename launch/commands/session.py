@@ -16,6 +16,8 @@ import typer
 from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.graph import (
     NoGraphError,
+    SeveralGraphsError,
+    describe_launch,
     find_node,
     receive_until,
     run_interruptible,
@@ -63,9 +65,13 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
     If messages were skipped or lost, a line under the table explains whether this matters.
 
     The command also prints the problems that the self-checks of the nodes suspect. The exit code is
-    1 if a problem is suspected, or if a node does not report its status.
+    1 if a problem is suspected, or if a node does not report its status. If several graphs are
+    running, the command prints their number, and which one it shows.
     """
+    from flexsheet.launch.running.runs import list_live_runs
+
     plan, found = running_graph(run)
+    live = list_live_runs()
     statuses: dict[str, Status] = {}
     hosts: dict[str, HostStatus] = {}
     run_interruptible(_collect_statuses(plan, found, statuses, hosts))
@@ -78,13 +84,14 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
                 "run": str(found.directory),
                 "launch_file": plan.launch_file,
                 "plan": plan.hash,
+                "running": [str(one.directory) for one in live],
                 "nodes": rows,
                 "self_checks": suspicions,
                 "estop": estops,
             }
         )
     else:
-        words.print(f"{plan.launch_file}, run {found.directory}")
+        _print_shown(plan, found, live)
         for row in rows:
             row["publishes"] = [
                 describe_output(one) for one in row["outputs"] if one["topic"] != "status"
@@ -103,6 +110,21 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
     silent = [name for name in plan.nodes if name not in statuses]
     if silent or any(one["suspected"] for one in suspicions):
         raise typer.Exit(FAILED)
+
+
+def _print_shown(plan: ResolvedGraph, shown: Run, live: Sequence[Run]) -> None:
+    """Print which graph is shown, and which other graphs are running.
+
+    live: all running graphs.
+    """
+    text = f"{plan.launch_file}, run {shown.directory}"
+    others = [one for one in live if one.directory != shown.directory]
+    if not others or len(others) == len(live):
+        words.print(text)
+        return
+    words.print(f"{len(live)} graphs are running; this is {text}")
+    for one in others:
+        words.print(f"to show {describe_launch(one)}: flexsheet status --run {one.directory}")
 
 
 async def _collect_statuses(
@@ -197,7 +219,14 @@ def _list_suspicions(statuses: dict[str, Status]) -> list[dict[str, Any]]:
     epilog=examples("flexsheet logs planner", "flexsheet logs arm_left_bridge --follow -n 20")
 )
 def logs(
-    node: NodeArgument,
+    node: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="NODE",
+            help="Name of a node of the graph; without it, the nodes are listed.",
+            autocompletion=complete.nodes,
+        ),
+    ] = None,
     lines: Annotated[
         int | None, typer.Option("-n", "--lines", min=0, help="Print the last N lines only.")
     ] = None,
@@ -207,16 +236,20 @@ def logs(
     run: options.RunOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Print the log of a node of the running graph.
+    """Print the log of a node of the running graph, or list the nodes.
 
     If no graph is running, the log is taken from the newest run.
     """
     from flexsheet.launch.plans.documents import did_you_mean
 
     found = _newest_run(run)
+    known = sorted(one.stem for one in found.logs.glob("*.log"))
+    if node is None:
+        print_rows([{"node": name} for name in known], as_json=as_json)
+        words.print("to print the log of a node: flexsheet logs NODE")
+        return
     file = found.logs / f"{node}.log"
     if not file.is_file():
-        known = sorted(one.stem for one in found.logs.glob("*.log"))
         raise CommandError(
             f'"{node}": {found.logs} contains no log of this node; {did_you_mean(node, known)}'
         )
@@ -268,7 +301,7 @@ def _further_lines(text: Any, run: Run) -> Iterator[str]:
 
 @stop_app.command(epilog=examples("flexsheet stop", "flexsheet stop --all"))
 def stop(
-    run: options.RunOption = None,
+    run: options.ChangedRunOption = None,
     stop_all: Annotated[
         bool, typer.Option("--all", help="Stop all graphs of this user on this computer.")
     ] = False,
@@ -285,8 +318,8 @@ def stop(
     chosen = [one for one in live if run is None or one.directory == run.resolve()]
     if not chosen:
         raise NoGraphError("no graph is running on this computer, so there is nothing to stop")
-    if not stop_all:
-        del chosen[1:]
+    if len(chosen) > 1 and not stop_all:
+        raise SeveralGraphsError(chosen)
     for each in chosen:
         os.kill(int(each.id.partition(".")[0]), signal.SIGTERM)
     end_s = time.monotonic() + STOP_TIMEOUT_S

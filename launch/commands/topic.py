@@ -13,12 +13,19 @@ import typer
 
 from flexsheet.launch.commands.graph import (
     NoGraphError,
+    choose_run,
     list_readers,
     receiving,
     run_interruptible,
     running_graph,
 )
-from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument, make_app
+from flexsheet.launch.commands.options import (
+    ChangedRunOption,
+    JsonOption,
+    RunOption,
+    TopicArgument,
+    make_app,
+)
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
@@ -39,16 +46,18 @@ if TYPE_CHECKING:
 
 app = make_app("List topics, and read or publish them in the running graph.")
 
-CountOption = Annotated[
-    int | None,
-    typer.Option(
+
+def _count_option(default: str) -> Any:
+    return typer.Option(
         "-t",
         "--count",
         metavar="N",
-        help="Number of messages after which the command stops; default: it runs until Ctrl-C.",
+        help=f"Number of messages after which the command stops; default: {default}.",
         min=1,
-    ),
-]
+    )
+
+
+CountOption = Annotated[int | None, _count_option("it runs until Ctrl-C")]
 WindowOption = Annotated[
     float,
     typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
@@ -252,12 +261,15 @@ def pub(
             "--rate",
             metavar="HZ",
             min=0.01,
-            help="Rate at which the message is repeated, Hz; default: send it once.",
+            help="Rate at which the message is repeated, Hz; default: 1 Hz with --count. Without "
+            "both options, the message is sent once.",
         ),
     ] = None,
-    once: Annotated[bool, typer.Option("-1", "--once", help="Send one message (default).")] = False,
-    count: CountOption = None,
-    run: RunOption = None,
+    once: Annotated[
+        bool, typer.Option("-1", "--once", help="Send one message (default without --rate).")
+    ] = False,
+    count: Annotated[int | None, _count_option("1, or with --rate until Ctrl-C")] = None,
+    run: ChangedRunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Publish a message to the running graph.
@@ -268,7 +280,7 @@ def pub(
     """
     from flexsheet.messages.topics import find_topic
 
-    found = find_topic(topic)
+    found, run = find_topic(topic), choose_run(run)
     built = _parse_message(found, message)
     times = 1 if once or (rate is None and count is None) else count
     sent = 0

@@ -473,15 +473,19 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
     if renamed is not None:
         what = f"{_shorten(error['input'])} is invalid"
         return document.problem(key, what, f'it was renamed to "{renamed}"')
+    name = next((part for part in reversed(key) if isinstance(part, str)), "")
+    return document.problem(key, *describe_value_error(error, name))
+
+
+def describe_value_error(error: Any, name: str) -> tuple[str, str]:
+    """Describe a pydantic error of the value `name`, and return the text and the remedy."""
+    what = f"{_shorten(error['input'])} is invalid"
     if error["type"] in NUMBER_ERROR_TYPES:
-        name = next((part for part in reversed(key) if isinstance(part, str)), "")
         unit = find_unit(name)
         is_plain = unit in ("", "1")
-        remedy = "write a number" if is_plain else f"write a number in {unit}, without the unit"
-        return document.problem(key, f"{_shorten(error['input'])} is invalid", remedy)
+        return what, "write a number" if is_plain else f"write a number in {unit}, without the unit"
     raised = error.get("ctx", {}).get("error")
-    message = str(raised) if isinstance(raised, Exception) else error["msg"]
-    return document.problem(key, f"{_shorten(error['input'])} is invalid", message)
+    return what, str(raised) if isinstance(raised, Exception) else error["msg"]
 
 
 def _existing_part(document: Document, key: Key) -> Key:

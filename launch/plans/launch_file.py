@@ -159,6 +159,20 @@ class LaunchFile(StrictModel):
     )
 
 
+def read_scene_file(path: Path) -> Document:
+    """Read a scene file, without checking its values.
+
+    Raises BadInputError if the file cannot be read, or if it is a launch file.
+    """
+    document = read_document(path)
+    keys = document.values.keys()
+    if {"nodes", "extends"} & keys and not SCENE_KEY_SET & keys:
+        named = document.values.get("scene")
+        remedy = f"give its scene: {named}" if isinstance(named, str) else "give a scene file"
+        raise BadInputError.single(str(path), (), "the file is a launch file, not a scene", remedy)
+    return document
+
+
 def is_scene_file(path: Path) -> bool:
     """Return whether a YAML file is a scene, and no launch file, calibration or apparatus.
 

@@ -25,7 +25,6 @@ from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
     Problem,
-    read_document,
     validate,
 )
 from flexsheet.launch.plans.features import Feature
@@ -36,6 +35,7 @@ from flexsheet.launch.plans.launch_file import (
     apply_record,
     apply_setting,
     read_launch_file,
+    read_scene_file,
 )
 from flexsheet.launch.plans.needed_nodes import omit_unneeded, remove_features
 from flexsheet.launch.plans.plan_model import (
@@ -175,7 +175,7 @@ def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, 
         )
         return None, None
     try:
-        scene_document = read_document(path)
+        scene_document = read_scene_file(path)
         return scene_document, make_scene(scene_document)
     except BadInputError as error:
         document.problems.extend(error.problems)
@@ -206,16 +206,7 @@ def load_scene(path: Path) -> Scene:
         raise BadInputError.single(
             str(path), (), "the file does not exist", name_shipped(path, SCENES)
         )
-    document = read_document(path)
-    if "nodes" in document.values:
-        scene = document.values.get("scene")
-        raise BadInputError.single(
-            str(path),
-            (),
-            "the file is a launch file, not a scene",
-            f"give its scene: {scene}" if isinstance(scene, str) else "give a scene file",
-        )
-    return make_scene(document)
+    return make_scene(read_scene_file(path))
 
 
 def _make_node(

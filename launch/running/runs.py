@@ -73,6 +73,14 @@ class Run:
         except FileNotFoundError:
             return None
 
+    @property
+    def launch_file(self) -> str | None:
+        """Return the launch file of the graph, or None if the plan is not written yet."""
+        try:
+            return str(json.loads(self.plan_file.read_text())["launch_file"])
+        except FileNotFoundError:
+            return None
+
     def is_alive(self) -> bool:
         """Return whether the run's launcher is alive and has not finished the run."""
         return (self.directory / _LAUNCHER_FILE).exists() and launcher_is_alive(self.id)

@@ -6,10 +6,10 @@ All launchers and arm bridges (nodes that control an arm) on this computer have 
 1. A request is sent to all sockets simultaneously. A launcher stores the stop and publishes it to
    all hosts. A bridge stops its own arm.
 2. Receivers that do not answer get the signal SIGCONT, because they can be suspended.
-3. If no launcher has answered, the bridges that do not answer are killed. The watchdogs of their
-   arms then stop the arms.
-4. If no receiver has answered, the nodes that send sheet targets are killed. If the bridges receive
-   no targets, they stop their arms on all hosts.
+3. If the launcher of a run has not answered, the bridges of the run that do not answer are killed.
+   The watchdogs of their arms then stop the arms.
+4. If no receiver of a run has answered, its nodes that send sheet targets are killed. If the
+   bridges receive no targets, they stop their arms on all hosts.
 
 This module imports few other modules, so that the stop is sent without delay.
 """
@@ -66,8 +66,12 @@ class StopOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopAttempt:
-    """An attempt to stop the arms; `after_ms` is the time from the first request to the outcome."""
+    """An attempt to stop the arms of the graph in the run directory `run`.
 
+    after_ms: time from the first request to the outcome.
+    """
+
+    run: Path
     path: StopPath
     receiver: str
     outcome: StopOutcome
@@ -81,6 +85,7 @@ class StopAttempt:
 
 @dataclass(slots=True)
 class _Receiver:
+    run: Path
     path: StopPath
     name: str
     connection: socket.socket
@@ -121,42 +126,43 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
     started_s = time.monotonic()
     attempts: list[StopAttempt] = []
 
-    def note(path: StopPath, receiver: str, outcome: StopOutcome) -> None:
+    def note(run: Path, path: StopPath, receiver: str, outcome: StopOutcome) -> None:
         after_ms = (time.monotonic() - started_s) * 1e3
-        attempts.append(StopAttempt(path, receiver, outcome, after_ms))
+        attempts.append(StopAttempt(run, path, receiver, outcome, after_ms))
 
     request = (REQUEST + reason.encode())[:MAX_REQUEST_BYTES]
     directories = list(runs)
     waiting: list[_Receiver] = []
-    for file in (one for directory in directories for one in directory.glob(f"*{SUFFIX}")):
+    for run, file in ((one, file) for one in directories for file in one.glob(f"*{SUFFIX}")):
         name, _, kind = file.stem.rpartition(".")
         connection = _send_request(file, request)
         if connection is None:
-            note(StopPath(kind), name, StopOutcome.ABSENT)
+            note(run, StopPath(kind), name, StopOutcome.ABSENT)
         else:
             process, _ = read_peer(connection)
-            waiting.append(_Receiver(StopPath(kind), name, connection, process))
+            waiting.append(_Receiver(run, StopPath(kind), name, connection, process))
     try:
         for until_s, signalled in ((CONTINUE_AFTER_S, signal.SIGCONT), (KILL_AFTER_S, None)):
             for receiver in _await_answers(waiting, started_s + until_s):
-                note(receiver.path, receiver.name, StopOutcome.CONFIRMED)
+                note(receiver.run, receiver.path, receiver.name, StopOutcome.CONFIRMED)
             for receiver in waiting if signalled else ():
                 _send_signal(receiver.process, signalled or 0)
-        # If a launcher stores the stop, a suspended bridge need not be killed. It commands no arm,
-        # and receives the stop when it resumes.
-        is_latched = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
+        # If the launcher stores the stop, a suspended bridge need not be killed. It commands no
+        # arm, and receives the stop when it resumes.
+        latched = {one.run for one in attempts if one.path is StopPath.LAUNCHER and one.worked}
         for receiver in waiting:
-            kill = receiver.path is StopPath.NODE and not is_latched
+            kill = receiver.path is StopPath.NODE and receiver.run not in latched
             if kill and _send_signal(receiver.process, signal.SIGKILL):
-                note(StopPath.SIGNAL, receiver.name, StopOutcome.KILLED)
+                note(receiver.run, StopPath.SIGNAL, receiver.name, StopOutcome.KILLED)
             else:
-                note(receiver.path, receiver.name, StopOutcome.SILENT)
+                note(receiver.run, receiver.path, receiver.name, StopOutcome.SILENT)
     finally:
         for receiver in waiting:
             receiver.connection.close()
-    if not any(attempt.outcome is StopOutcome.CONFIRMED for attempt in attempts):
-        for name in _kill_target_senders(directories):
-            note(StopPath.SIGNAL, name, StopOutcome.KILLED)
+    confirmed = {one.run for one in attempts if one.outcome is StopOutcome.CONFIRMED}
+    for run in (one for one in directories if one not in confirmed):
+        for name in _kill_target_senders(run):
+            note(run, StopPath.SIGNAL, name, StopOutcome.KILLED)
     return attempts
 
 
@@ -202,30 +208,29 @@ def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
     return confirmed
 
 
-def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
-    """Kill the nodes that publish sheet targets in the given runs.
+def _kill_target_senders(run: Path) -> list[str]:
+    """Kill the nodes that publish sheet targets in a run.
 
     Returns the names of the killed nodes.
     """
+    try:
+        nodes = json.loads((run / "plan.json").read_text())["nodes"]
+    except (OSError, ValueError, KeyError):
+        return []
+    senders = {
+        os.fsencode(run / f"{node.get('process') or name}.json"): name
+        for name, node in nodes.items()
+        if any(port["topic"] == TARGET_TOPIC for port in node["outputs"])
+    }
     killed = []
-    for directory in directories:
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
         try:
-            nodes = json.loads((directory / "plan.json").read_text())["nodes"]
-        except (OSError, ValueError, KeyError):
+            named = senders.keys() & set(entry.read_bytes().split(b"\0"))
+        except OSError:
+            # The process has ended, or belongs to another user.
             continue
-        senders = {
-            os.fsencode(directory / f"{node.get('process') or name}.json"): name
-            for name, node in nodes.items()
-            if any(port["topic"] == TARGET_TOPIC for port in node["outputs"])
-        }
-        for entry in Path("/proc").glob("[0-9]*/cmdline"):
-            try:
-                named = senders.keys() & set(entry.read_bytes().split(b"\0"))
-            except OSError:
-                # The process has ended, or belongs to another user.
-                continue
-            if named and _send_signal(int(entry.parent.name), signal.SIGKILL):
-                killed.append(senders[named.pop()])
+        if named and _send_signal(int(entry.parent.name), signal.SIGKILL):
+            killed.append(senders[named.pop()])
     return killed
 
 

@@ -20,7 +20,7 @@ import signal
 import stat
 import subprocess
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -56,6 +56,7 @@ from flexsheet.launch.running.runs import (
     Run,
     create_run,
     is_free,
+    list_live_runs,
     local_endpoints,
     local_sources,
     ring_file,
@@ -321,6 +322,8 @@ class RunningGraph:
     without: names of nodes that are not started.
     report: function that is called with (node, line) for every log line. The folder `run.logs` also
         contains all lines.
+    port_options: for parameters "node.name" that are ports, the options of the command that set
+        them. Other ports are set by --set.
     """
 
     def __init__(
@@ -330,8 +333,10 @@ class RunningGraph:
         host: str | None = None,
         without: Collection[str] = (),
         report: Report | None = None,
+        port_options: Mapping[str, str] | None = None,
     ) -> None:
         self.plan, self._host, self._report_to = plan, host, report
+        self._port_options = port_options
         self.nodes = [node for node in plan.nodes_on(host) if node.name not in without]
         self._processes = {one.name: one for one in plan.processes_on(host, without=without)}
         self.exit_codes: dict[str, int] = {}
@@ -549,7 +554,7 @@ class RunningGraph:
         if self._processes:
             # The fork server imports modules while this process prepares the run.
             self._start_fork_server()
-        _check_ports(self.plan, self._host)
+        _check_ports(self.plan, self._host, self._port_options)
         if self.plan.keys:
             self._rings = make_rings(self.plan, self.run, self._host)
             self._keys_watch = asyncio.create_task(self._watch_keys(), name="keys")
@@ -975,35 +980,62 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
             )
 
 
-def _name_port_options(plan: ResolvedGraph, port: int) -> str:
+def _name_port_options(plan: ResolvedGraph, port: int, options: Mapping[str, str]) -> str:
     """Return the options that change a port at the nodes that listen and connect, or ""."""
-    options = [
-        f"--set {node.name}.{name}=PORT"
+    names = [
+        options.get(f"{node.name}.{name}", f"--set {node.name}.{name}=PORT")
         for node in plan.nodes.values()
         for name, value in node.parameters.items()
         if value == port and (port in node.listen_ports or node.device_address)
     ]
-    return f": {' '.join(options)}" if options else ""
+    return f": {' '.join(names)}" if names else ""
 
 
-def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
-    """Raise BadInputError if a TCP port of this launcher's processes is in use."""
-    needed = [
+def _list_ports(plan: ResolvedGraph, host: str | None) -> list[tuple[str, str, int]]:
+    """Return the user, the address and the number of each TCP port of a launcher's processes."""
+    topics = [
         (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))
         for topic, writers in plan.writers.items()
         for writer in writers
         if writer.tcp is not None and host in (None, writer.host)
     ]
-    needed += [(node, "127.0.0.1", str(port)) for node, port in plan.listening_nodes(host)]
-    problems = [
-        Problem(
-            plan.launch_file,
-            (),
-            f"port {port} of {address}, for {what}, is in use",
-            f"stop the other program, or choose another port{_name_port_options(plan, int(port))}",
-        )
-        for what, address, port in needed
-        if not is_free(address.strip("[]"), int(port))
+    return [(what, address.strip("[]"), int(port)) for what, address, port in topics] + [
+        (node, "127.0.0.1", port) for node, port in plan.listening_nodes(host)
     ]
-    if problems:
-        raise BadInputError(problems)
+
+
+def _find_port_users() -> dict[tuple[str, int], Run]:
+    """Return the running graph of this user that uses each address and TCP port."""
+    users: dict[tuple[str, int], Run] = {}
+    for run in list_live_runs():
+        try:
+            plan = ResolvedGraph.model_validate_json(run.plan_file.read_text())
+        except (OSError, ValueError):
+            # The graph is starting, has ended, or belongs to another version of flexsheet.
+            continue
+        users |= {(address, port): run for _, address, port in _list_ports(plan, run.host)}
+    return users
+
+
+def _check_ports(
+    plan: ResolvedGraph, host: str | None, port_options: Mapping[str, str] | None = None
+) -> None:
+    """Raise BadInputError if a TCP port of this launcher's processes is in use.
+
+    port_options: see `RunningGraph`.
+    """
+    used = [one for one in _list_ports(plan, host) if not is_free(*one[1:])]
+    if not used:
+        return
+    users = _find_port_users()
+
+    def make_problem(what: str, address: str, port: int) -> Problem:
+        text = f"port {port} of {address}, for {what}, is in use"
+        remedy = "stop the other program"
+        if (run := users.get((address, port))) is not None:
+            text += f" by the running graph of {run.launch_file}"
+            remedy = f"stop it: flexsheet stop --run {run.directory}"
+        options = _name_port_options(plan, port, port_options or {})
+        return Problem(plan.launch_file, (), text, f"{remedy}, or choose another port{options}")
+
+    raise BadInputError([make_problem(*one) for one in used])

@@ -15,7 +15,7 @@ from typing import Literal
 
 from flexsheet.messages.methods import SoftBodyMethod, resolve_method
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.cache import load_cached
+from flexsheet.nodes.cache import advise_precompute, load_cached
 from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 from flexsheet.nodes.fem_solver.table import Table
 
@@ -127,10 +127,8 @@ class SoftBodyFactory:
         )
         if not waits_for_table or self.friction_ratio > 0.0 or len(made) > 1:
             return ""
-        return (
-            "; the scene's nonlinear table is not computed yet; run flexsheet precompute SCENE "
-            f"--skin-spacing {self.skin_spacing_m:g}"
-        )
+        advice = advise_precompute(scene, f" --skin-spacing {self.skin_spacing_m:g}")
+        return f"; the scene's nonlinear table is not computed yet; {advice}"
 
     def build_table(
         self,

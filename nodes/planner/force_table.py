@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.methods import SheetForceMethod
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.cache import Specification, cached, load_cached
+from flexsheet.nodes.cache import Specification, advise_precompute, cached, load_cached
 from flexsheet.nodes.methods import Progress
 from flexsheet.nodes.models.sheet.force_models import (
     ScaledSheetModel,
@@ -105,6 +105,6 @@ def load_force_model(
     entry = make_table_cache(scene)
     table = load_cached(entry, cache_dir) or load_cached(entry, FOLDER)
     if table is None:
-        note = "scaled; the table of the sheet's force is missing: run flexsheet precompute"
+        note = f"scaled; the table of the sheet's force is missing; {advise_precompute(scene)}"
         return ScaledSheetModel(rubber), note
     return table, method

@@ -15,6 +15,7 @@ from flexsheet.messages.methods import SheetShapeMethod
 from flexsheet.messages.scene import Mesh, Scene, require_projector
 from flexsheet.messages.types import Display, SheetTarget, Skin, SoftBody
 from flexsheet.nodes.arrays import Floats, Image
+from flexsheet.nodes.cache import advise_precompute
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import corners
@@ -71,8 +72,7 @@ screen."""
 MIN_REPORTED_FRACTION = 0.005
 """The unlit fraction of a folded sheet above which the attribute `note` reports the folds."""
 NO_SHAPES_NOTE = (
-    "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles; "
-    "run flexsheet precompute"
+    "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles"
 )
 
 GRID_WINDOW = ScreenRectangle(-0.151, -0.151, 0.302, 0.302)
@@ -384,8 +384,10 @@ class SceneRenderer:
         reduced_order. The attribute `note` states why the mesh is inaccurate, or is empty.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
-            lacks_shapes = self.sheet_shape == "reduced_order"
-            self.note = NO_SHAPES_NOTE if lacks_shapes else self._range_note(sheet)
+            if self.sheet_shape == "reduced_order":
+                self.note = f"{NO_SHAPES_NOTE}; {advise_precompute(self.scene)}"
+            else:
+                self.note = self._range_note(sheet)
             mesh = pyramid_mesh(sheet)
             return mesh if self._lens is None else refine_mesh(mesh)
         mesh = deflected_mesh(
