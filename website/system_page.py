@@ -14,18 +14,23 @@ from website.sensitivity_page import METRICS
 
 SYSTEM = "system.json"
 PARTS = ("points", "front")
+DRAWN_SCENE = "cylinder"
+"""The scene in the picture of the README: the demo's."""
 
 
 def draw(results: Path, images: Path) -> None:
-    """Draw the first scene of the recorded measurement."""
+    """Draw the recorded measurement of the demo's scene."""
     result = _read(results / SYSTEM)["results"]
-    scene = result["points"][0]["scene"]
-    first = {key: [one for one in result[key] if one["scene"] == scene] for key in PARTS}
-    draw_system_chart(first, images / "system.svg")
+    drawn = {key: [one for one in result[key] if one["scene"] == DRAWN_SCENE] for key in PARTS}
+    draw_system_chart(drawn, images / "system.svg")
 
 
 def render_system(results: Path) -> str:
-    """Return a table with the configurations of each scene in the system chart, in Markdown."""
+    """Return a table with the configurations of each scene in the system chart, in Markdown.
+
+    An error is the 95 % value with nominal hardware, and in parentheses the median and the maximum
+    of the 95 % values with random apparatuses.
+    """
     heads = ("scene", "configuration", "cores", "to arm, ms", "to light, ms", *METRICS.values(),
              "exceeds")  # fmt: skip
     rows = []
@@ -38,12 +43,20 @@ def render_system(results: Path) -> str:
             point["configuration"],
             f"{point['cpu_cores']:.2f}",
             *(_format_latency(point[f"exposure_to_{end}_ms"]) for end in ("arm", "light")),
-            *("–" if point[key] is None else f"{point[key]:.2f}" for key in METRICS),
+            *(_format_error(point, key) for key in METRICS),
             ", ".join(key.removesuffix(".p95") for key in point["failing"]) or "–",
         )
         rows.append(cells)
     machine = f"{record['machine']}, load {record['load']:.1f}; `{record['command']}`."
     return f"{format_table(heads, rows)}\n{machine}"
+
+
+def _format_error(point: Mapping[str, Any], key: str) -> str:
+    random = point["random_apparatuses"].get(key)
+    if point[key] is None:
+        return "–"
+    spread = "" if random is None else f" ({random['median']:.2f}, {random['max']:.2f})"
+    return f"{point[key]:.2f}{spread}"
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -80,7 +80,15 @@ def _draw_front(
             capsize=2,
         )
         label = name if point["meets_tolerances"] else f"{name}\nexceeds: {_failing(point)}"
-        axes.annotate(label, (x, y), (6, 6), textcoords="offset points", fontsize=7, color=colour)
+        axes.annotate(
+            label,
+            (x, y),
+            (6, 6),
+            textcoords="offset points",
+            fontsize=7,
+            color=colour,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
+        )
         if name in front:
             corners.append((x, y))
     if len(corners) > 1:
@@ -130,7 +138,8 @@ def _bars(one: Interval, y: float) -> list[list[float]] | None:
 def _draw_errors(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:
     """Draw a bar for each error as a ratio to its tolerance.
 
-    The bar of the sheet's error is stacked by the processing stages that contribute to it.
+    The bar of the sheet's error is stacked by the processing stages that contribute to it. A white
+    dot is the median of the error over random apparatuses; a line connects it with their maximum.
     """
     width = 0.8 / max(len(points), 1)
     for number, (colour, point) in enumerate(zip(COLOURS, points, strict=False)):
@@ -148,14 +157,31 @@ def _draw_errors(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:
                 bottom += part
             interval = Interval(**ratio)
             bars = _bars(interval, height)
-            if bars is not None:
+            if bars is not None and interval.high > interval.low:
                 axes.errorbar(at, height, yerr=bars, color=INK, linewidth=1, capsize=2)
+            random = point["random_apparatuses"].get(key)
+            if random is not None and point[key]:
+                median, most = (random[name] * height / point[key] for name in ("median", "max"))
+                axes.errorbar(
+                    at,
+                    median,
+                    yerr=[[0.0], [most - median]],
+                    color=INK,
+                    linewidth=0.8,
+                    capsize=2,
+                    marker="o",
+                    markersize=3,
+                    markerfacecolor="white",
+                )
         axes.bar(0.0, 0.0, color=colour, label=_label(point))
     axes.axhline(1.0, color=INK, linestyle="--", linewidth=1)
     axes.set_xticks(range(len(ERRORS)), [NAMES[key] for key in ERRORS])
     axes.set_ylabel("95 % error / tolerance")
     stages = next((point["budget"] for point in points if point["budget"]), {})
-    axes.set_title("sheet, from dark to light: " + ", ".join(stages), fontsize=9)
+    title = "sheet, from dark to light: " + ", ".join(stages)
+    if runs := max((point["random_apparatuses"]["runs"] for point in points), default=0):
+        title += f"\ndot and line: median and maximum over random apparatuses (n = {runs})"
+    axes.set_title(title, fontsize=9)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set_ylim(bottom=0.0)
     axes.grid(visible=True, axis="y", alpha=0.2)
