@@ -336,8 +336,9 @@ async def _replay_run(
 class NodeRun:
     """The execution log of a node, from one start of the node to the next start.
 
-    steps: integers (n, 4), one row for each executed step. The columns are input, sequence number,
-        epoch and time (ns). The input is its index, or -1 minus the index of a timer.
+    steps: integers (n, 4), one row for each call of a message handler or timer. For a message, the
+        columns are input index, sequence number, epoch (start time) of the writer, and call time
+        (ns). For a timer, the first column contains -1 minus the index of the timer.
     """
 
     clock_id: str

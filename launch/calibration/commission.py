@@ -441,7 +441,11 @@ def format_verdict(state: State) -> list[str]:
 
 
 def is_good(state: State) -> bool:
-    """Return whether the verification is finished and found no reason for doubt."""
+    """Return whether the display errors in a laboratory are verified to be within the tolerances.
+
+    The verification must be finished. The function `list_doubts` must also have found no reason why
+    an error may exceed a tolerance.
+    """
     figures = _verification_figures(state)
     return bool(figures) and not figures.get("doubts")
 

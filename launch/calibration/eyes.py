@@ -176,9 +176,13 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
         )
 
     def offsets(eye: Floats) -> Floats:
-        """Return the shortest vectors (n, 3), in m, from the lines of sight to the crosses.
+        """Return the vectors (n, 3), in m, from the lines of sight to the measured crosses.
 
-        eye: position (3,) of the eye.
+        Each vector is perpendicular to its line of sight, which passes through the eye and a bead.
+        If the eye position is exact, the line also passes through the cross on the sheet that
+        belongs to the bead.
+
+        eye: assumed position (3,) of the eye.
         """
         directions, far = beads - eye, crosses - eye
         directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -224,11 +228,13 @@ def read_alignments(path: Path) -> list[Alignment]:
 def simulate_alignments(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> list[Alignment]:
-    """Simulate the alignments of a viewer, as measured by the simulated stereo camera.
+    """Simulate how a viewer aligns a bead with crosses on the sheet, and measure the positions.
 
-    The arms hold the flat sheet at the origin of the world. An alignment is omitted if the viewer
-    does not see the sheet behind the bead. It is also omitted if the camera does not detect the
-    bead or the cross.
+    The alignment is simulated for each eye and several positions of the bead. The simulated stereo
+    camera measures the bead and the cross. The arms hold the flat sheet at the origin of the world.
+
+    The result omits an alignment if the viewer does not see the sheet behind the bead. It also
+    omits an alignment if the camera does not detect the bead or the cross.
 
     apparatus: true parameters of the simulated hardware.
     calibration: camera parameters for the detector. If None, the scene's parameters are used.

@@ -506,7 +506,7 @@ def _solve_closed_form(
 
 
 def _unstack_rotation(stacked: Floats) -> Floats:
-    """Return the rotation (3, 3) that is nearest to a multiple of a matrix.
+    """Return the rotation (3, 3) that is nearest to a matrix of unknown scale and sign.
 
     stacked: columns of the matrix as one vector (9,).
     """
@@ -517,9 +517,10 @@ def _unstack_rotation(stacked: Floats) -> Floats:
 def _compute_discrepancies(
     unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Return the differences (n, 6) between n flange poses from joint angles and from images.
+    """Compare the flange poses from the images with the flange poses from the joint angles.
 
-    A difference is a rotation vector (rad) and a translation (m) in the frame of the flange.
+    Return a pose difference (6,) for each of n arm poses, as an array (n, 6). Each difference is a
+    rotation vector (rad) and a translation (m) in the flange's frame.
     """
     found = []
     for flange, board in zip(flanges, boards, strict=True):

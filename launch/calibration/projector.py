@@ -319,9 +319,9 @@ def fit_keystone(
 ) -> ProjectorFit:
     """Fit a projector to the pixels that light the corners of a rectangle on the imaginary screen.
 
-    Many projectors light four given corners exactly, because the corners determine only a
-    homography. The result is the projector whose parameters are nearest to `guess`, with the same
-    lens distortion as `guess`.
+    The corners determine only a homography, so projectors with different parameters can light them
+    exactly. The result is the projector whose parameters are nearest to `guess`. Its lens
+    distortion is the same as in `guess`.
 
     corners_px: projector pixels (4, 2) of the corners bottom left, bottom right, top right and top
         left, as the user sees them.

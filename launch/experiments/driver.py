@@ -95,7 +95,9 @@ PROGRESS_PERIOD_S = 5.0
 
 @dataclass(slots=True)
 class Waiter:
-    """A wait for a condition, with a deadline that frames from the renderer postpone.
+    """A pending wait for a condition, with a deadline.
+
+    Each frame that the renderer publishes postpones the deadline, up to a limit.
 
     seconds: time (s) to wait after the start, and after each frame that postpones the deadline.
     latest_s: latest deadline, in the time of the event loop.
@@ -251,10 +253,12 @@ class Driver:
     def make_timeout_error(
         self, what: str, error: type[ExperimentError] = ExperimentError
     ) -> ExperimentError:
-        """Return the error of a wait that took too long; its text contains the notes of the nodes.
+        """Make an error that reports a timeout and the status notes of all nodes.
 
-        what: first part of the error text. error: type of the error, unless a computer is
-            overloaded.
+        If a computer is overloaded, the result is an OverloadedError that names the overload.
+
+        what: first part of the error text.
+        error: type of the error if no computer is overloaded.
         """
         busy = [text for host in self._hosts.values() if (text := describe_busy(host))]
         notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
@@ -423,7 +427,10 @@ class Driver:
 
 
 def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
-    """Return whether a solver node uses a table for a scene, and computes a missing table."""
+    """Return whether a solver node requires a precomputed table of deformations for a scene.
+
+    If such a table is missing, the node computes it.
+    """
     method, _ = choose_method(
         scene,
         parameters.method,

@@ -284,9 +284,12 @@ def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
 
 
 def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
-    """Return the largest jump between fingertips, and the number of jumps above the limit SIGMAS.
+    """Summarize the jumps between consecutive position estimates of the fingertip.
 
-    errors: (n, 3), errors of the n fingertips, m.
+    Return the largest jump in standard deviations and in mm, and the number of jumps above SIGMAS
+    standard deviations.
+
+    errors: (n, 3), errors of the n position estimates, m.
     """
     if len(tips) < 2:
         return {"max_sigmas": None, "max_mm": None, "beyond_3_sigmas": 0}

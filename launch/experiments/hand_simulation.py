@@ -72,14 +72,15 @@ class Cases:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The result of a simulation of n hands.
+    """The result of a simulation of n hands, which are released near their equilibrium.
 
     decay_per_s (n,): decay rate of the oscillation between the second and the last quarter of the
         time; infinite if the oscillation has decayed completely.
     amplitude_m (n,): amplitude in the last quarter.
-    energy_ratio (n,): largest energy that the sheet delivers to the finger in any 2 s, relative to
-        the energy at release. The energy from a passive sheet is subtracted, and the first eighth
-        of the time is ignored.
+    energy_ratio (n,): maximum energy that the sheet delivers to the finger in any 2 s. It is
+        divided by the elastic energy of the displacement from which the finger is released. The
+        energy that a passive elastic sheet would deliver is subtracted. The first eighth of the
+        time is ignored.
     """
 
     decay_per_s: Floats

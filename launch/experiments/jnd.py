@@ -215,9 +215,9 @@ class StaircaseSession:
     """
 
     def __init__(self, plan: SessionPlan, file: Path, *, now: Callable[[], str]) -> None:
-        """Start a session, or continue the session of an existing file.
+        """Start a new session. If `file` exists, continue the session that the file contains.
 
-        now: function that returns the present time as text.
+        now: function that returns the current date and time as text.
         """
         self.plan, self.file, self._now = plan, file, now
         self.estimator = StaircaseEstimator()

@@ -133,10 +133,11 @@ class Evaluation:
         }
 
     def change_from(self, other: Evaluation) -> dict[str, float | None]:
-        """Return each metric's mean difference from another evaluation of the same simulated cases.
+        """Return the change of each metric from another evaluation of the same simulated cases.
 
-        Errors of single vectors, pixels and pushes are subtracted before averaging. Therefore
-        errors common to both evaluations cancel. The units are those of `figures`.
+        The errors of both evaluations are subtracted for each contact point, pixel and push. The
+        differences are then averaged, so errors that both evaluations have in common cancel. The
+        method `figures` states the unit of each metric.
         """
         image = None
         if self.image_m is not None and other.image_m is not None:
@@ -192,7 +193,11 @@ class CrossErrors:
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return the mean, maximum, per-eye and disparity errors (mm) of the crosses."""
+        """Return the errors (mm) of the drawn crosses as statistics over all crosses.
+
+        The mean and the maximum are computed from the average of both eyes. The result also
+        contains the mean error of each eye and the mean error of the horizontal disparity.
+        """
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {
@@ -220,7 +225,9 @@ class Contact:
 
 
 class OfflineEvaluator:
-    """An evaluator of the errors of apparatuses (true hardware parameters) in one scene.
+    """A model that computes the display errors in one scene without running the nodes.
+
+    The errors are computed for given sets of true hardware parameters (apparatuses).
 
     metres_per_px: resolution of the images.
     cells: number of mesh intervals per side of the true sheet.
@@ -318,9 +325,11 @@ class OfflineEvaluator:
 
     @staticmethod
     def _lay_sheet(point: Floats, normal: Floats, on_sheet_m: Floats) -> Contact:
-        """Return the contact of a sheet with the given normal (3,) at a surface point (3,).
+        """Place a sheet tangent to the object at a surface point, and return the contact.
 
-        on_sheet_m: coordinates (3,) of the contact point on the sheet.
+        point: surface point (3,) in the world.
+        normal: unit normal (3,) of the sheet.
+        on_sheet_m: coordinates (3,) of the contact point in the sheet's frame.
         """
         x_axis = np.array([1.0, 0.0, 0.0]) - normal * normal[0]
         x_axis /= np.linalg.norm(x_axis)
@@ -382,8 +391,9 @@ class OfflineEvaluator:
     ) -> Floats:
         """Return the error (3,) of the sheet's contact point, in m, in the world frame.
 
-        The error is the object point under the true finger minus the contact point. The arms move
-        the sheet to the measured finger.
+        The error is the vector from the contact point of the sheet to the object point under the
+        true finger. The error occurs because the arms move the sheet to the measured finger, and
+        because the true hardware deviates from the scene.
 
         tip_error: measured minus true fingertip (3,).
         """
@@ -477,10 +487,10 @@ class OfflineEvaluator:
         return self._correct_parallax(errors, eye)
 
     def _estimate_sheet(self, edges: tuple[Floats, Floats], finger_tip: Floats | None) -> SheetPose:
-        """Return the sheet that the renderer assumes between resting edges.
+        """Return the pose of the sheet that the renderer computes from the poses of resting edges.
 
-        edges: poses (4, 4) of the edges. finger_tip: position (3,), m; None if no finger touches
-        the sheet.
+        edges: poses (4, 4) of the left and the right clamped edge.
+        finger_tip: position (3,), m; None if no finger touches the sheet.
         """
         height_m = self._scene.sheet.height_m
         sheet = estimate_sheet(*edges, height_m=height_m, finger_tip=finger_tip)

@@ -214,11 +214,12 @@ def make_image_procedure(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> Procedure:
-    """Make a procedure that captures an image of each simulated case (value and correction method).
+    """Make a procedure that captures an image of the sheet for each value and image correction.
 
-    with_maps: whether to take images of coordinate ramps, from which the errors at all visible
-        points are computed.
-    with_eyes: whether to take images for each eye separately.
+    values: values of the quantity that the experiment `series` varies.
+    with_maps: whether to also take images of coordinate ramps, whose brightness encodes a
+        coordinate. The errors at all visible points are computed from these images.
+    with_eyes: whether to also take images of coordinate ramps for each eye separately.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -242,7 +243,11 @@ def make_image_procedure(
 
 
 def make_table_procedure(progress: Progress) -> Procedure:
-    """Make a procedure that waits until the soft body uses a precomputed table."""
+    """Make a procedure that waits until the soft body is computed by a precomputed table.
+
+    A procedure is a coroutine that controls the running graph. The table contains solutions of the
+    nonlinear deformation of the object.
+    """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         await driver.wait_for_table(scene, "quick_table", progress)

@@ -229,7 +229,10 @@ class FilmedFinger:
 
 
 class SimulatedArm:
-    """A simulated arm: the control methods of its bridge, and the servo model of the simulator."""
+    """A simulated arm with a servo model, commanded by the methods of the arm bridge.
+
+    The arm bridge is the node that controls an arm.
+    """
 
     def __init__(
         self,
@@ -609,11 +612,13 @@ def touch_in_simulated_time(
     bounds: OffsetBoundsTable,
     settings: LoopSettings | None = None,
 ) -> TouchRecording:
-    """Simulate a hand that moves along a voluntary path while the sheet pushes the finger.
+    """Simulate a hand that touches the sheet while the sheet's force displaces the finger.
 
+    path: voluntary path, along which the finger would move without the force of the sheet.
     curve: (n, 2), n pairs of depth (m) and force (N) of the object.
-    make_finger: function that makes the simulated finger from its voluntary path.
-    bounds: the planner's bounds on the sheet's offset.
+    make_finger: function that makes the simulated finger and hand from the voluntary path.
+    bounds: limits of the sheet's offset along its normal, within which the planner keeps the
+        control loop stable.
     """
     voluntary = validate_path(path.times_s, path.positions_world_m, path.joined_by)
     compliance = ComplianceController(

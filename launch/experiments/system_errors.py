@@ -244,9 +244,12 @@ class RestingPush:
         self._planner = SheetTrajectoryPlanner(scene, settings)
 
     def rest_at(self, tip: Floats, surface: Floats) -> SheetMotion:
-        """Return the planned sheet motion after the finger has rested at a point.
+        """Let the finger rest at a point, and return the sheet motion that is then planned.
 
-        tip: fingertip (3,), m. surface: point (3,) of the object at the first contact, m.
+        If the finger is not in contact yet, it first touches the object at `surface`.
+
+        tip: fingertip (3,), m.
+        surface: point (3,) of the object, m.
         """
         if not self._planner.in_contact:
             self._rest(surface)

@@ -40,9 +40,10 @@ class Album:
     """A selection of image sets: sets at regular intervals, and the first set after each bookmark.
 
     limit: maximum number of image sets at regular intervals.
-    bookmarks: (time in s, label) of each bookmark, in the order of time.
+    bookmarks: time (s) and label of each bookmark, in the order of time.
     count: number of all image sets in the session.
-    left_out: number of image sets at bookmarks that are not stored.
+    left_out: number of image sets that follow a bookmark but are not stored, because too many image
+        sets at bookmarks are already stored.
     """
 
     limit: int
