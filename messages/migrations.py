@@ -177,7 +177,10 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
 
 
 def _literal_schema(model: str, recorded: Schema, current: Schema) -> Schema:
-    """Return a recorded JSON Schema in which text fields that became literals have the new type."""
+    """Return a recorded JSON Schema in which some fields have their current literal type.
+
+    These are the fields in TEXTS_TO_LITERALS, which contained text when old bags were recorded.
+    """
     properties = recorded.get("properties")
     if not isinstance(properties, Mapping):
         return recorded

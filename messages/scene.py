@@ -38,7 +38,7 @@ MAX_AXIS_ERROR = 1e-6
 class Part(MessagePart, LimitedModel):
     """The base class of the parts of scenes and calibrations.
 
-    Each number has a limit that depends on its unit.
+    The validation rejects a number that exceeds the limit for its unit.
     """
 
 

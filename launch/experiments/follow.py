@@ -218,7 +218,7 @@ class RolledSheet:
 
 
 class FollowedContact:
-    """A model of a sheet that follows a finger exactly, and of small deviations from its motion."""
+    """A model of a sheet that exactly follows a finger, and of small deviations from its path."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))

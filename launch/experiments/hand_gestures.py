@@ -184,7 +184,7 @@ class FeltForce:
 
 
 def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) -> FeltForce:
-    """Compute the felt force and the object's force during a recorded touch.
+    """Compute the sheet's force on the finger and the virtual object's force during a touch.
 
     curve: (n, 2), n pairs of depth (m) and force (N) of the object.
     """

@@ -127,7 +127,8 @@ class Trial:
 def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
     """Return the simulated cases of all combinations of trials and gains.
 
-    The cases of one trial are consecutive.
+    The gain multiplies the sheet's motion around the equilibrium. The cases of one trial are
+    consecutive.
     """
 
     def repeat(values: Iterable[float]) -> Floats:
@@ -343,9 +344,9 @@ def stability_result(
 ) -> dict[str, Any]:
     """Simulate hands on the sheet; return the result of `flexsheet experiment stability --json`.
 
-    The first simulation increases the slope between the finger depth and the sheet's offset until a
-    hand becomes unstable. The second simulation tests whether hands are stable with objects of
-    several stiffnesses.
+    The first simulation finds the critical slope, above which a hand is unstable. The slope is the
+    change of the sheet's offset divided by the change of the finger depth. The second simulation
+    tests whether hands are stable with objects of several stiffnesses.
     """
     boundary = measure_boundary(settings, progress)
     rows = measure_map(scene, model, curve, settings, progress)

@@ -147,11 +147,11 @@ class Layout:
         return bool(self.reached.all()) and not self.blocked_paths
 
     def speed_m_per_s(self, fraction: float) -> float:
-        """Return the finger speed (m/s) that both arms can follow at a given fraction of samples.
+        """Return the finger speed (m/s) that both arms can follow at most sampled sheet poses.
 
-        Only reachable samples are considered. Return 0 if no sample is reachable.
+        Only samples that both arms can reach are considered. Return 0 if no sample is reachable.
 
-        fraction: fraction from 0 to 1.
+        fraction: fraction of these samples, from 0 to 1, at which the arms must be able to follow.
         """
         if not self.reached.any():
             return 0.0
@@ -175,10 +175,12 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
     """Sample contact points on the object, with sheet poses at each point.
 
     The contact points are sampled from all directions within the scene's tilt range. In the first
-    pose at each contact point, the object touches the centre of the sheet. In the other poses, the
-    sheet has rolled to this contact point from another contact, so the object touches another point
-    of the sheet. For each axis of the sheet, the two rolls are used that end farthest from the
-    sheet's centre. Contacts outside the sheet's usable area are moved to the border of this area.
+    pose at each contact point, the object touches the centre of the sheet.
+
+    The other poses result from rolling the sheet without slip from other contact points, so that
+    the object touches another point of the sheet. For each axis of the sheet, only the rolls that
+    end at the smallest and the largest sheet coordinate are used. If this point is outside the
+    sheet's usable area, it is moved to the border of the area.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)
@@ -265,8 +267,8 @@ def _list_contacts(
 def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
     """Combine each contact with each push depth, and with the minimum and the maximum stretch.
 
-    A push moves the sheet along its normal. The arms must also follow a push at the scene's working
-    speed.
+    Each sample contains the sheet velocities that the arms must follow. These are the velocities of
+    strokes over the object, and of a push along the sheet's normal at the scene's working speed.
     """
     sheet = scene.sheet
     longest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
@@ -514,11 +516,12 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the fraction of samples that violate a given limit more than all other limits.
+    """Return how often samples violate a certain limit of an arm, and at which tilt this begins.
 
-    The result also describes the sample that has the smallest tilt among these samples.
+    A sample is counted if it violates this limit more than all other limits. The result contains
+    the fraction of counted samples, and describes the counted sample with the smallest tilt.
 
-    number: index of the given limit.
+    number: index of the limit.
     binding: for each of n samples, index (n,) of the limit that is violated most; -1 for reachable
         samples.
     """

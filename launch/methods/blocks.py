@@ -62,10 +62,10 @@ def compare_paired(values: Floats, control: Floats) -> Interval | None:
 
 
 def attribute_error(parts: Floats) -> Floats:
-    """Return the fractions (k,) of a mean square error that k error components cause.
+    """Return how much each of k error components contributes to the mean square error.
 
-    The fractions add up to one. A component that compensates other components has a negative
-    fraction.
+    The contributions (k,) are fractions that add up to one. A contribution is negative if the
+    component partly cancels other components.
 
     parts: error components (k, n, d), each with n vectors of d dimensions. Their sum is the total
         error.

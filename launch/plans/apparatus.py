@@ -78,8 +78,9 @@ def parse_draw(text: str) -> Draw | None:
 def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> Apparatus:
     """Read true hardware parameters from a file, or sample them from a text such as "seed:7".
 
-    scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
-        sampled relative to the scene before commissioning, in the world frame of the camera.
+    scene_file: file of the scene. If this scene is the result of a calibration (commissioning),
+        uncalibrated hardware is sampled relative to the original scene. The world frame of the
+        result is then defined by the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
@@ -104,9 +105,11 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
 
 
 def _load_base(scene_file: Path | None) -> Scene | None:
-    """Load the scene from which the commissioning of a scene file started.
+    """Load the original scene, from which a calibrated scene was made by commissioning.
 
-    Return None if the file does not result from a commissioning.
+    Return None if the scene file is not the result of a commissioning.
+
+    scene_file: file of the calibrated scene.
     """
     state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
     if state is None or not state.is_file():

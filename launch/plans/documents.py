@@ -155,7 +155,7 @@ class Document:
         return str(self.path)
 
     def folder(self, key: Key) -> Path:
-        """Return the base folder of a relative path in the value of `key`.
+        """Return the folder relative to which a path in the value of `key` is given.
 
         This is the folder of the file that contains `key`. If a command-line option overrides the
         value, the current folder is returned.

@@ -42,9 +42,10 @@ class Waits:
 
 
 class CpuWatch:
-    """A monitor of the times that processes wait for cores and use cores, over the last WINDOW_S.
+    """A monitor that measures how long processes wait for a processor core.
 
-    Call `update` once a second.
+    Waiting times are measured over the last WINDOW_S seconds. The monitor also finds the programs
+    that use the cores. Call `update` once a second.
 
     proc: folder of the kernel's counters.
     now_s: function that returns the time (s) of the monotonic clock.

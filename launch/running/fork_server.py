@@ -278,10 +278,12 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
 
 
 def _write_arguments(arguments: list[str]) -> None:
-    """Replace the arguments of this process in /proc, because tools identify nodes by them.
+    """Replace the command-line arguments of this process in /proc, by which tools identify nodes.
 
-    The remaining space is filled with an argument of spaces, which precedes the last two arguments.
-    Raises ValueError if the space is too small.
+    The new arguments must have the same total length as the old arguments. An argument that
+    consists of spaces is therefore inserted before the last two arguments.
+
+    Raises ValueError if the new arguments are too long.
     """
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     start, end = int(fields[_ARGUMENTS_START]), int(fields[_ARGUMENTS_END])

@@ -296,9 +296,10 @@ class HostAgent:
             await asyncio.sleep(PERIOD_S)
 
     def _report_busy(self, status: HostStatus) -> None:
-        """Log that the processor became overloaded, at most once per BUSY_REPORT_PERIOD_S.
+        """Log that the processor is overloaded, at most once per BUSY_REPORT_PERIOD_S.
 
-        The second status in sequence is logged, because the first does not list the programs.
+        The log entry is made from the second consecutive status with an overload. The first such
+        status does not yet list the programs that use the processor.
         """
         now_ns = self._clock.now_ns()
         self._busy_statuses = self._busy_statuses + 1 if is_busy(status) else 0

@@ -118,10 +118,12 @@ If `send_early` was called, this list contains one list of attempts. Otherwise, 
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
-    """Engage the e-stop in the runs with these directories, and return all attempts.
+    """Engage the e-stop in several runs of graphs, and return the outcome of each attempt.
 
     The steps are listed at the beginning of this module. The function waits at most KILL_AFTER_S
     for answers before it kills processes.
+
+    runs: directories of the runs.
     """
     started_s = time.monotonic()
     attempts: list[StopAttempt] = []
