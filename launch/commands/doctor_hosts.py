@@ -102,8 +102,8 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
     """Return the resolved graph of a launch file, and its run on this computer.
 
-    A run is one execution of a graph. It is None if the graph is not running. If `launch_file` is
-    None, the newest running graph is used.
+    A run is one execution of a graph. The result contains None instead of a run if the graph is not
+    running. If `launch_file` is None, the newest running graph is used.
     """
     from flexsheet.launch.plans.plan import load_graph
 

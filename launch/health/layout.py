@@ -147,11 +147,12 @@ class Layout:
         return bool(self.reached.all()) and not self.blocked_paths
 
     def speed_m_per_s(self, fraction: float) -> float:
-        """Return the finger speed (m/s) that both arms can follow at most sampled sheet poses.
+        """Return the finger speed (m/s) that both arms can follow in a fraction of the samples.
 
-        Only samples that both arms can reach are considered. Return 0 if no sample is reachable.
+        A sample is a sheet pose with a stretch and a push depth. Samples that an arm cannot reach
+        are ignored. Return 0 if no sample is reachable.
 
-        fraction: fraction of these samples, from 0 to 1, at which the arms must be able to follow.
+        fraction: required fraction of the reachable samples, from 0 to 1.
         """
         if not self.reached.any():
             return 0.0

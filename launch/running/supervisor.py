@@ -1014,7 +1014,10 @@ def _list_ports(plan: ResolvedGraph, host: str | None) -> list[tuple[str, str, i
 
 
 def _find_port_users() -> dict[tuple[str, int], Run]:
-    """Return this user's running graphs by the addresses and TCP ports that they use."""
+    """Return a mapping from (address, TCP port) to the running graph that uses the port.
+
+    Only graphs of this user are found.
+    """
     users: dict[tuple[str, int], Run] = {}
     for run in list_live_runs():
         try:
