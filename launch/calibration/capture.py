@@ -48,7 +48,10 @@ image's diagonal.
 
 
 class BinGroup(StrEnum):
-    """The groups of conditions (`Bin`), in the order in which the user is asked to meet them."""
+    """The types of conditions that the image pairs of a calibration must meet (`Bin`).
+
+    The user is asked to meet the conditions in the order of these types.
+    """
 
     TILT = "tilt"
     DISTANCE = "distance"

@@ -114,11 +114,11 @@ class StepResult(LimitedModel):
     advice: text that states what to do if the residual exceeds `limit`.
     uncertainty: standard deviations by name. Each name ends in the unit.
     scene_values: new values for the scene, by dotted path in the scene file.
-    parameters: names of calibration files in the folder. Each key TYPE.PARAMETER names a node type
-        and its parameter, which is set to the file name.
+    parameters: names of calibration files in the folder, by node parameter. Each key has the form
+        "NODE_TYPE.PARAMETER".
     node_values: measured values of other node parameters.
     missing: quantities that were not measured.
-    figures: further results.
+    figures: other results of the step, by name.
     covariances: covariance matrices by name, for the prediction of errors.
     """
 
@@ -533,7 +533,7 @@ def list_doubts(
     The list is empty if there are no reasons.
 
     figures: results of the step "verification".
-    tracking: sheet error (mm) that the devices report for the stroke of the finger, and the
+    tracking: mean measured error (mm) of the sheet while it follows a stroke of the finger, and the
         tolerance (mm) of this error.
     check_command: command line that repeats the verification.
     """

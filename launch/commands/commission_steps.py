@@ -139,12 +139,14 @@ def open_laboratory(
 class Laboratory:
     """The devices of one laboratory: simulated devices, or files with the data of real devices.
 
-    apparatus: true parameters of simulated devices, in the world frame of the camera. It is None if
-        the devices are real.
-    data: for each step, the file or folder with the captured data.
+    apparatus: true parameters of simulated devices, or None if the devices are real. All poses
+        refer to the world frame in which the stereo camera has its pose from the scene.
+    data: file or folder with the data captured for each calibration step, for real devices.
+    board, flange_board: calibration boards for the stereo camera and for the arms.
     finger_radius_m: measured radius of the fingertip, for real devices.
     sheet_kg_per_m2: measured mass per area of a real sheet.
     seconds: duration of the finger's stroke in the verification.
+    seed: random seed of the simulation.
     simulated_time: whether to verify simulated devices in simulated time, without a running graph.
     pairs, arm_poses, sheet_poses: numbers of simulated image pairs, arm poses and sheet poses.
     """

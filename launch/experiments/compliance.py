@@ -100,7 +100,8 @@ class Press:
     """A press of the finger at a position on the object.
 
     place: name of the position.
-    place_m: distance (m) along the object, and arc length (m) around the object from its front.
+    place_m: coordinates (m) of the position on the object's surface, relative to the centre of the
+        front. The first is along the object, and the second is the arc length around the object.
     surface, normal: point (3,) and normal (3,) of the undeformed object at this position, in the
         world frame.
     holds: intervals in which the finger rests and the force is evaluated; empty if the finger moves
@@ -170,8 +171,10 @@ def _make_press(
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
     """Make the procedure that presses the finger at all positions of the experiment.
 
-    method: least accurate method whose table is accepted. Before the first press, the procedure
-        waits until the soft body uses a table that is at least as accurate.
+    Before the first press, the procedure waits until the soft-body node uses a sufficiently
+    accurate table of deformations.
+
+    method: soft-body method with the least accurate table that is sufficient.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:

@@ -153,7 +153,9 @@ def evaluate_path(bag: Path, label: str) -> DemoResult | None:
 
 
 def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
-    """Return the errors with which the sheet followed the finger path that has the given label.
+    """Return the sheet's errors while it followed a finger path, from a bag.
+
+    label: label of the finger path.
 
     Raises ExperimentError if the bag does not contain the path.
     """

@@ -223,11 +223,12 @@ class Driver:
 
         description: name of the condition in the error text.
         seconds: time to wait.
-        max_frames: number of renderer frames that restart the wait.
+        max_frames: number of frames that can extend the wait. After each such frame from the
+            renderer, the full time is waited again.
         max_seconds: limit of the total time.
+        error: class of the error that is raised if the condition is not met in time.
 
-        Raises `error` if the condition is not met in time, or OverloadedError if a computer is
-        overloaded.
+        Raises OverloadedError instead if a computer is overloaded.
         """
         if condition():
             return

@@ -235,9 +235,12 @@ class FollowedContact:
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
-        """Return the sheet after it has rolled over the object to each of n finger positions.
+        """Roll the sheet over the object without slip, and return its pose at each of n finger
+        positions.
 
-        positions_world: finger positions (n, 3), m. The sheet starts at the front of the object.
+        The sheet starts at the front of the object, and rolls from one position to the next.
+
+        positions_world: finger positions (n, 3), m.
         """
         object_from_world = inverse(self._world_from_object)
         front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))

@@ -103,10 +103,10 @@ class Motion:
 
 
 class HeldOffset:
-    """A control loop with a filter and a delay that computes the sheet's offset from finger depths.
+    """A simulated control loop that sets the sheet's offset along its normal from the finger depth.
 
-    Until the next offset takes effect, the sheet continues to move at its last rate, as the real
-    arms do.
+    A filter and a delay are simulated. Until a new offset takes effect, the sheet continues to move
+    at its last rate, as the real arms do.
     """
 
     def __init__(self, cases: Cases, offset: Curve, period_s: float, step_s: float) -> None:

@@ -118,7 +118,7 @@ PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (
 
 
 def make_push_series(along_mm: float, tilt_deg: float) -> Series:
-    """Return the push experiment at a position on the side of the cylinder.
+    """Return a series of simulated pushes with increasing depth at a position on the cylinder.
 
     along_mm: position along the axis, measured from the centre.
     tilt_deg: angle around the axis, measured from the front.
@@ -140,7 +140,10 @@ They are used to measure the image error at all visible points.
 
 
 def make_pattern_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the image that shows a pattern in the simulated case `label`."""
+    """Return the label of an image that shows a pattern.
+
+    label: label of the simulated case.
+    """
     return f"{label}, {pattern}"
 
 
@@ -277,7 +280,9 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum size error (mm) of each correction method."""
+    """Return the mean and the maximum error of the seen object's size for each correction method,
+    mm.
+    """
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),

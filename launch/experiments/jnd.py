@@ -1,26 +1,26 @@
 """Measure the Weber fraction of stiffness with an adaptive staircase, and store its trials.
 
-In each trial, the participant pushes two objects and names the stiffer object. One of them is the
-reference, and the other one is stiffer by the relative increment d. The probability of a correct
-answer is
+In each trial, the participant pushes two objects in succession, and names the stiffer one. One
+object is the reference, and the other one is stiffer by the relative increment d. The probability
+of a correct answer is
 
     p(d) = lapse / 2 + (1 - lapse) * Phi(ln(1 + d) / sigma +- bias),
 
 with the normal distribution function Phi (Green & Swets, Signal detection theory, 1966). The lapse
 rate is the fraction of trials that are answered at random. Sigma is the standard deviation of the
-perceived difference of two log stiffnesses. The bias is a preference for the second interval. It is
-added if the second interval has the stiffer object, and subtracted otherwise. The Weber fraction w
-is the increment at which 75 % of the answers would be correct if there were no lapses and no bias.
-Therefore ln(1 + w) = 0.674 sigma.
+perceived difference of two log stiffnesses. The bias is a preference for the second object of a
+trial. The bias is added if the second object is stiffer, and subtracted if the first object is
+stiffer. The Weber fraction w is the increment at which 75 % of the answers would be correct if
+there were no lapses and no bias. Therefore ln(1 + w) = 0.674 sigma.
 
 Each trial uses the increment that gives the least expected entropy of the posterior of w. This is
 the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown
 lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w is
-inversely proportional to the square root of the number of trials; `docs/jnd.md` states the
-measured error.
+inversely proportional to the square root of the number of trials; `docs/jnd.md` states the measured
+error.
 
-The trials are stored in a CSV file, which is the only state of a session. After an interruption,
-all stored answers are replayed.
+The trials are stored in a CSV file. An interrupted session is continued from the answers in this
+file.
 """
 
 from __future__ import annotations

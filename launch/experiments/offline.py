@@ -80,7 +80,10 @@ UNIT_COVARIANCE_PX2 = np.eye(2)
 
 
 class Metric(StrEnum):
-    """The names of the evaluated errors in the results."""
+    """The types of errors that are evaluated.
+
+    Each value is the key of the error in the results, and ends in the error's unit.
+    """
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -317,7 +320,7 @@ class OfflineEvaluator:
         The sheet starts in contact with the front of the object.
 
         around_m: arc length around the object from the front to the new contact point.
-        aside_m: distance from the front to the new contact point, to the right.
+        aside_m: distance that the contact point moves to the right.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))
@@ -498,11 +501,13 @@ class OfflineEvaluator:
         return sheet
 
     def compare_crosses(self, apparatus: Apparatus) -> CrossErrors:
-        """Compare crosses drawn at expected contact points with the actual contact points.
+        """Compute the errors between projected crosses and the actual contact points.
 
-        Each cross marks a point of the object, and is drawn on the sheet for each eye. The sheet
-        then moves to a finger that touches it at the measured position of the cross. Raises
-        ExperimentError if the touched point cannot be computed.
+        Each cross marks an expected contact point of the object, and is projected onto the sheet
+        for each eye. The finger then moves to the expected contact point, and the sheet follows the
+        measured finger. An error is the vector from the actual contact point to the cross, as seen
+        by the eye. Raises ExperimentError if a contact point cannot be computed, or if all crosses
+        miss the sheet.
         """
         scene = apply_apparatus(self._scene, apparatus)
         arms = ArmPair(self._scene, apparatus)
@@ -551,10 +556,11 @@ class OfflineEvaluator:
         return CrossErrors(places[seen_by_both], found[seen_by_both])
 
     def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
-        """Convert image errors (rows, columns, 2), in m, to errors relative to the true eye.
+        """Convert image errors (rows, columns, 2), in m, from the scene's eye position to the true
+        one.
 
-        The errors are measured relative to the image that the eye of the scene should see. From the
-        true eye position, the same object points should appear elsewhere on the screen plane.
+        The given errors are displacements from the correct image for the scene's eye position. The
+        results are displacements from the correct image for the true eye position `eye` (3,).
         """
         believed_eye = self._scene.eyes.centre_world_m
         if np.array_equal(eye, believed_eye):

@@ -48,7 +48,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def apparatus_text(seed: int, profile: Profile, *, calibrated: bool) -> str:
-    """Return the value of the option --apparatus that selects random true hardware parameters."""
+    """Return a value of the option --apparatus that makes the hardware parameters random."""
     return f"seed:{seed},{profile.value}{',calibrated' if calibrated else ''}"
 
 

@@ -158,7 +158,9 @@ async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
 
 
 def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """Return the launch setting "NODE.parameter=value" for all nodes of a type or a derived type.
+    """Return launch settings that set a parameter of all nodes of a type, including derived types.
+
+    Each setting has the form "NODE.parameter=value".
 
     setting: text "parameter=value".
     """

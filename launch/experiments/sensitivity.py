@@ -187,9 +187,11 @@ def _make_row(
 
 
 def rank(scene: Scene, rows: Sequence[Row]) -> list[Row]:
-    """Return the measured parameters, sorted by their worst effect at a deviation of one sigma.
+    """Return the parameters, sorted by their worst effect at a deviation of one standard deviation.
 
-    The key `share` is the effect divided by the scene's tolerance of the metric.
+    Each result is a dictionary with the keys `parameter`, `share` and `metric`. The value `share`
+    is the largest error divided by its tolerance in the scene, and `metric` is the type of this
+    error.
     """
     limits = metric_tolerances(scene)
     ranked = []

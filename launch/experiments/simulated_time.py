@@ -146,10 +146,12 @@ class MeasuredFinger:
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Measure the finger at a timestamp, and return its predicted positions (n, 3), in m.
+        """Simulate a measurement of the finger, and return its predicted positions (n, 3), in m.
+
+        The simulated cameras expose their images slightly after the timestamp `at_ns`.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
-            timestamp, (3,). The images are exposed slightly later.
+            timestamp, (3,).
         """
         truth, random = self._truth, self._random
         late_s = truth.stamp_offset_s - self._stamp_offset_s

@@ -90,7 +90,8 @@ class DrawnFrames:
 
     fingertip: drawn fingertip position (3,), m.
     sheet: centre (m) and normal of the drawn sheet, (6,).
-    deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
+    deformation_ages: age (s) of the finger measurement from which the drawn deformation was
+        computed, (1,).
     """
 
     fingertip: list[tuple[int, Floats]]
@@ -220,16 +221,15 @@ class StrokeRecording:
     """The data of a stroke experiment, read from a bag.
 
     fingertip, measured, finger: filtered, measured and true position of the fingertip.
-    windows_ns: start and end (ns) of each finger path; the keys are the labels of the paths.
-    measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
-        y axis and z axis of an edge in the world frame.
-    delays_s: delays from the centre of an exposure to the events that it caused; the keys are the
-        kinds of events.
-    drops: number of lost or refused messages, without those that a `latest` reader skipped.
+    windows_ns: start and end (ns) of each finger path, by label of the path.
+    measured_edges, true_edges: motion of the left and the right clamped edge of the sheet. Each row
+        (9,) contains the centre, y axis and z axis of an edge in the world frame.
+    delays_s: delays from the centre of an exposure to its effects, by kind of effect.
+    drops: number of lost or refused messages. Messages that a node skips because it needs only the
+        latest one are not counted.
     apparatus: origin of the true parameters of the simulated hardware.
-    surface, true_surface: shape of the unloaded sheet according to the scene, and according to the
-        apparatus.
-    loads: times (ns) of load reports of the computers, and whether the computer was overloaded.
+    surface, true_surface: shape of the unloaded sheet in the scene and in the simulated hardware.
+    loads: time (ns) of each load report of a computer, and whether the computer was overloaded.
     """
 
     scene: Scene

@@ -120,10 +120,11 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """A risk that `find_loop_risk` has found in the control loop of sheet and hand.
+    """A risk in the control loop of sheet and hand, found by `find_loop_risk`.
 
     delay_s: time from the measurement of a push depth until the sheet has moved.
-    error_ratio: maximum relative error of the rendered force within the stability limits.
+    error_ratio: maximum relative error of the rendered force if the sheet moves only as far as the
+        loop is stable.
     """
 
     risk: LoopRisk

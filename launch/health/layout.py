@@ -617,9 +617,9 @@ def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class _TiltDepthGrid:
-    """A grid over the tilt and push depth of samples.
+    """A grid over the tilt and push depth of the n sampled contacts of a layout.
 
-    rows, columns: row and column (n,) of the grid cell that contains each of n samples.
+    rows, columns: row and column (n,) of the grid cell that contains each sample.
     frame: options for drawing the grid with Matplotlib's `imshow`.
     """
 

@@ -28,10 +28,13 @@ def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[s
 
 
 def bootstrap_median(values: Floats) -> Interval | None:
-    """Return the median of n values, one per block, with the confidence interval of the median.
+    """Return the median of n measured values, with its bootstrap confidence interval.
 
-    The value of a failed run is NaN. Returns None if no value is finite. If only one value is
-    finite, the limits of the interval are infinite.
+    values: values (n,) of independent runs, one from each block of the measurement. NaN means that
+        a run failed.
+
+    Returns None if no value is finite. If only one value is finite, the limits of the interval are
+    infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:

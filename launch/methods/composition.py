@@ -392,14 +392,17 @@ def _find_cheaper(
     tolerances: Figures,
     margin: float,
 ) -> Combination | None:
-    """Return the cheapest untested combination that costs less than the best run.
+    """Return the cheapest untested combination of methods that costs less than the best tested one.
 
-    The combination must be predicted to be as good as the best run. Returns None if there is no
-    such combination.
+    Its predicted errors must meet the tolerances, or at least be as small as those of the best
+    tested combination. Returns None if there is no such combination.
 
-    The errors of a method are worst-case errors, so the sum over all methods overestimates the
-    errors of the system. The predictions are therefore multiplied by the ratio of measured to
-    predicted errors in the best run.
+    The predicted errors are sums of worst-case errors, which are larger than the errors of the
+    system. They are therefore corrected by the ratio of measured to predicted errors of the best
+    tested combination.
+
+    best: result of the best tested combination.
+    margin: fraction by which the tolerances are reduced.
     """
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     limits = _relax(allowed, [best.measured])

@@ -72,7 +72,10 @@ FINEST = NODE_DEFAULTS.model_copy(
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """A choice of methods for all nodes, with further parameters of the planner by name."""
+    """A choice of methods for all nodes, with values of further planner parameters.
+
+    planner: values of the planner parameters, by parameter name.
+    """
 
     name: str
     methods: Methods
@@ -181,7 +184,7 @@ def list_configurations(scene: Scene) -> list[Configuration]:
 
 
 def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
-    """Return the configurations with the given names, and the control configuration.
+    """Return the configurations with the given names, and the one with which they are compared.
 
     If no name is given, all configurations are returned. Raises ExperimentError if a name is
     unknown.

@@ -177,7 +177,10 @@ def plan_configurations(
 
 
 def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
-    """Return launch settings that give the finger the same random motion in all runs of a block."""
+    """Return launch settings that give the finger the same random motion in all runs of a block.
+
+    A block is one run of each configuration that is compared.
+    """
     seed = FINGER_SEED + block
     return [f"{node.name}.seed={seed}" for node in graph.nodes_of_type("twin_finger")]
 
@@ -420,8 +423,8 @@ def worst_ratio(point: Mapping[str, Any]) -> Interval:
 def find_system_front(points: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the names of a scene's configurations that are on the Pareto front.
 
-    The compared costs are the latency from exposure to arm, the processor cores, and the worst
-    error relative to its tolerance.
+    The compared costs are the latency from the camera's exposure to the arm's motion, the number of
+    used processor cores, and the largest error-to-tolerance ratio.
     """
     costs = {}
     for point in points:

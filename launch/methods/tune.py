@@ -85,7 +85,10 @@ class Tunable:
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
-    """Return the scene settings of all methods that the `Literal` type `methods` names."""
+    """Return the scene setting of each method, by method name. The setting is the method's name.
+
+    methods: `Literal` type that contains the method names.
+    """
     return {name: name for name in get_args(methods)}
 
 
@@ -460,13 +463,15 @@ def insert_choices(
     commit: str | None,
     unmet: str = "",
 ) -> str:
-    """Return the text of a scene file with the choices inserted in its mapping `methods`.
+    """Return the text of a scene file with the chosen methods inserted in its mapping `methods`.
 
-    All other text is unchanged, including the methods of other method families. If `methods` is a
-    mapping on one line, it is expanded to several lines.
+    All other text is unchanged, including methods for which no choice is given. If `methods` is a
+    mapping on one line, it is expanded to several lines. A comment before the mapping states the
+    origin of the choices.
 
-    today, machine, commit: date, computer and git commit for the generated comment.
-    unmet: sentences for the comment about tolerances that are not met.
+    choices: chosen methods.
+    today, machine, commit: date, computer and git commit for the comment.
+    unmet: sentences for the comment that describe exceeded tolerances, or an empty text.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"

@@ -57,7 +57,7 @@ class Draw:
 def parse_draw(text: str) -> Draw | None:
     """Parse the value of `--apparatus`; return None if the value is a file name.
 
-    Raises BadInputError if the value starts with "seed:" but is not a valid random sample.
+    Raises BadInputError if the value starts with "seed:" but has a wrong format.
     """
     if not text.startswith("seed:"):
         return None

@@ -187,7 +187,7 @@ class Document:
         self.text = f"# {base.path}\n{base.text}\n# {self.path}\n{self.text}"
 
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
-        """Return a problem that is located at `key` in this document.
+        """Return the description of an error in this file, with the location of the key.
 
         what: description of the error.
         remedy: what the user should do.

@@ -197,7 +197,7 @@ class ResolvedProcess:
 
     @property
     def settings(self) -> ResolvedNode:
-        """Return the first node. Its process settings apply to all nodes of the process."""
+        """Return the node whose process settings apply to the whole process: the first node."""
         return self.nodes[0]
 
     @property

@@ -89,7 +89,7 @@ def resolve_further_inputs(
     """Add the inputs that depend on node parameters, such as the topics of a recorder.
 
     writers: (writer, host) pairs by topic.
-    document: launch file to which problems are reported.
+    document: contents of the launch file. Errors such as unknown topics are stored in it.
     """
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:

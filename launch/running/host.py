@@ -312,9 +312,9 @@ class HostAgent:
             self._on_problem(f"{describe_busy(status)}; {remedy}")
 
     def _limit_real_time(self) -> None:
-        """Withdraw the real-time priorities of this graph if another node gets no processor.
+        """Withdraw the real-time priorities of this graph's nodes if they starve another node.
 
-        All ready nodes are checked, including nodes of high niceness, which are expected to wait.
+        All running nodes are checked, including those of low priority (high niceness).
         """
         pids = self._pids()
         ready = {one.name for one in self._processes() if one.state == "ready"}
@@ -391,7 +391,8 @@ def has_estop(state: ArmState) -> bool:
 def list_arms(plan: ResolvedGraph) -> list[str]:
     """Return the network addresses of the arms.
 
-    If an arm has no address, it is represented by the text "host/node" of its bridge.
+    If an arm has no address, the text "HOST/NODE" is returned for it. It names the node that
+    controls the arm.
     """
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]

@@ -184,9 +184,9 @@ def _send_request(file: Path, request: bytes) -> socket.socket | None:
 
 
 def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Wait for confirmations until `until_s`.
+    """Wait until `until_s` for launchers and arm bridges to confirm an emergency stop.
 
-    Receivers that confirm are removed from `waiting` and returned.
+    The receivers that confirm the stop are removed from `waiting` and returned.
 
     until_s: time of the monotonic clock, s.
     """

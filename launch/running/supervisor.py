@@ -833,9 +833,10 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the graph's scene file as JSON files into `folder`.
+        """Write the scenes that can be selected at run time as JSON files into a folder.
 
-        Nodes that publish scenes read these files.
+        These are all scenes in the same folder as the scene file of the graph. Nodes that publish
+        scenes read the JSON files.
         """
         folder.mkdir()
         own = self.plan.scene_file
