@@ -158,8 +158,8 @@ def verify(
     progress: function that is called with the number of replayed messages and the total number of
         messages.
 
-    Raises BagError if the bag does not contain the node, its inputs or a valid launch file, or if
-    the node cannot be replayed.
+    Raises BagError if the node cannot be replayed, or if the bag does not contain the node, its
+    inputs or a valid launch file.
     """
     reader = BagReader(bag)
     plan = _read_plan(reader)

@@ -1,8 +1,7 @@
 """Evaluate a stereo calibration by measuring a board of known size.
 
 Errors are underestimated on image pairs that were used to calibrate. Therefore, `check_stereo`
-requires further pairs, and `cross_check` measures each pair with a calibration that does not use
-it.
+requires other pairs, and `cross_check` measures each pair with a calibration that does not use it.
 """
 
 from __future__ import annotations

@@ -164,9 +164,9 @@ def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
 def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Floats, float]:
     """Fit the position of one eye, starting from the position `start` (3,).
 
-    In each alignment, the user holds a bead such that the eye sees it on a projected cross. Returns
-    the position (3,) in m, its covariance (3, 3), and the rms angle (rad) between the directions
-    from the eye to bead and cross.
+    In each alignment, the viewer has moved a bead until it covers a projected cross for this eye.
+    Returns the position (3,) in m, its covariance (3, 3), and an rms angle (rad). The angle is
+    between the directions from the fitted eye to the bead and to the cross.
     """
     beads = np.array([one.bead_m for one in alignments])
     crosses = np.array([one.cross_m for one in alignments])

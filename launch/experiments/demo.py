@@ -139,9 +139,11 @@ def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
 
 
 def evaluate_path(bag: Path, label: str) -> DemoResult | None:
-    """Evaluate the finger path that has the given label.
+    """Evaluate how the sheet followed a finger path, and write the results and a figure to files.
 
     Return None if the bag does not yet contain the path.
+
+    label: label of the finger path.
     """
     if not is_path_recorded(bag, label):
         return None

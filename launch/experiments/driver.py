@@ -223,8 +223,7 @@ class Driver:
 
         description: name of the condition in the error text.
         seconds: time to wait.
-        max_frames: number of frames that can extend the wait. After each such frame from the
-            renderer, the full time is waited again.
+        max_frames: maximum number of renderer frames that restart this time.
         max_seconds: limit of the total time.
         error: class of the error that is raised if the condition is not met in time.
 

@@ -235,8 +235,7 @@ class FollowedContact:
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
-        """Roll the sheet over the object without slip, and return its pose at each of n finger
-        positions.
+        """Roll the sheet over the object without slip, and return its pose at n finger positions.
 
         The sheet starts at the front of the object, and rolls from one position to the next.
 

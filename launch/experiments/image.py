@@ -280,8 +280,8 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum error of the seen object's size for each correction method,
-    mm.
+    """Return the mean and maximum error (mm) of the object's visible size for each correction
+    method.
     """
     return {
         method: {

@@ -245,7 +245,8 @@ def make_image_procedure(
 
 
 def make_table_procedure(progress: Progress) -> Procedure:
-    """Make a procedure that waits until the soft body is computed by a precomputed table.
+    """Make a procedure that waits until the soft-body node uses a precomputed table of
+    deformations.
 
     A procedure is a coroutine that controls the running graph. The table contains solutions of the
     nonlinear deformation of the object.

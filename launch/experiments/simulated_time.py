@@ -106,7 +106,8 @@ class LoopSettings:
     """The settings of a simulation run.
 
     planner: parameters of the planner, with their names as keys.
-    lag_known: whether the bridges know the true servo lag of the arms; otherwise they measure it.
+    lag_known: whether the nodes that control the arms know the true servo lag; otherwise they
+        measure it.
     computing_s: time from the end of the camera's read-out to the published target.
     calibrations: calibrated parameters that the nodes use. If None, the nodes know camera, marker
         and exposure times exactly.

@@ -134,7 +134,7 @@ class ErrorEvaluator:
         contains the fraction of the sheet's mean square error that each stage of `STAGES` causes.
 
         methods: all methods of the configuration.
-        planner: further parameters of the planner.
+        planner: values of further planner parameters, by parameter name.
         """
         has_image, has_force = self.scene.projector is not None, self.scene.object.material
         moving = (methods.marker, methods.tracking, *planner.items())

@@ -178,10 +178,10 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
     The contact points are sampled from all directions within the scene's tilt range. In the first
     pose at each contact point, the object touches the centre of the sheet.
 
-    The other poses result from rolling the sheet without slip from other contact points, so that
-    the object touches another point of the sheet. For each axis of the sheet, only the rolls that
-    end at the smallest and the largest sheet coordinate are used. If this point is outside the
-    sheet's usable area, it is moved to the border of the area.
+    In the other poses, the object touches another point of the sheet, because the sheet has rolled
+    without slip from another contact point. Of these poses, only those with the extreme contact
+    positions along the two axes of the sheet are used. A contact position outside the sheet's
+    usable area is moved to the border of the area.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)

@@ -96,7 +96,7 @@ class Unexplained:
     parts: Figures = field(default_factory=dict)
 
     def learn(self, combination: Combination, measured: Figures) -> Unexplained:
-        """Return this difference of measured and predicted metrics, updated by a run of the graph.
+        """Return the unexplained errors after an update with the measured metrics of a run.
 
         With the result, `predict` does not underestimate the measured metrics of the combination.
 
@@ -200,8 +200,8 @@ class GraphRun:
 
     methods: names of the methods, by processing stage.
     cores: number of processor cores that the combination is expected to use.
-    predicted, measured: system metrics before and after the run, as 95 % quantiles. If a metric
-        cannot be measured in the run, its predicted value is used for both.
+    predicted, measured: predicted system metrics, and metrics measured in the run, as 95 %
+        quantiles. If a metric cannot be measured, its predicted value is used for both.
     exceeded: ratio of value to tolerance of each metric that exceeds its tolerance.
     """
 

@@ -120,10 +120,10 @@ class Configuration:
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return the cheapest method of each family whose range contains the scene's working range.
+    """Return the cheapest method of each family that is valid in the scene's whole working range.
 
-    Errors are not considered. If no method of a method family has a sufficient range, the method
-    with the largest range is returned.
+    Errors are not considered. If no method of a method family is valid in the whole range, the
+    method with the largest valid range is returned.
     """
     depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
     stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)

@@ -369,8 +369,8 @@ def tune(
 ) -> list[Choice]:
     """Measure interchangeable methods, and choose one method of each method family in `tunables`.
 
-    The exception of a method family is raised if the family does not support the scene's shape,
-    mesh or sheet.
+    If a method family does not support the scene's shape, mesh or sheet, an exception of this
+    family is raised.
 
     margin: fraction of each tolerance that remains unused, as a reserve for cases that are not
         measured.

@@ -145,7 +145,7 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
 def resolve_entry(entry: NodeEntry, document: Document) -> None:
     """Find the node's class, connect its ports, and check its parameters.
 
-    Problems are reported to `document`.
+    document: contents of the launch file. Errors are stored in it.
     """
     key = entry.key
     type_name = entry.spec.type

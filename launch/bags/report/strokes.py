@@ -71,8 +71,8 @@ class FingerRun:
     end_ns: time of the last exposure before the finger gets another path. The finger rests at the
         end of the path from `done_ns` to `end_ns`.
     stroke_s: duration of the finger's stroke; None if the path is not a stroke of an experiment.
-    sums: statistics of the sheet's errors during the stroke. They are relative to the measured
-        finger and to the true finger.
+    sums: statistics of the sheet's errors during the stroke, relative to the measured finger and to
+        the true finger.
     """
 
     label: str
