@@ -408,7 +408,9 @@ class RecordedInputs:
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """Return the message of an input port with the given sequence number and epoch.
+        """Return the message of an input port with the given sequence number.
+
+        epoch: start time of the node that sent the message.
 
         Return None if the bag does not contain the message.
         """

@@ -140,7 +140,7 @@ class StepResult(LimitedModel):
 
 
 class StepRecord(LimitedModel):
-    """The record of one finished or skipped step of a commissioning."""
+    """The record of one finished or skipped step in the calibration of a laboratory."""
 
     name: StepName
     date: str
@@ -151,7 +151,7 @@ class StepRecord(LimitedModel):
 
 
 class State(LimitedModel):
-    """The state of a commissioning: its input files, and its finished and skipped steps."""
+    """The state of the calibration of a laboratory: input files, and finished and skipped steps."""
 
     version: Literal[1] = 1
     launch_file: str
@@ -372,7 +372,7 @@ MEASURED_IN_OPERATION = (
 
 
 def format_report(state: State) -> str:
-    """Return the report of a commissioning as Markdown.
+    """Return the report on the calibration of a laboratory as Markdown.
 
     The report contains residuals, uncertainties, predicted errors and the causes of the largest
     errors.

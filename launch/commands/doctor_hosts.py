@@ -84,7 +84,8 @@ def hosts(
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
     """Check the hosts of the running graph; return an empty list if no graph is running.
 
-    If the graph runs on one host, only the findings of the nodes' self-checks are returned.
+    If the graph runs on one host, only the results of the nodes' own calibration checks are
+    returned.
     """
     from flexsheet.launch.health.doctor_hosts import SELF_CHECK
     from flexsheet.launch.running.runs import list_live_runs

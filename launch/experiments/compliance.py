@@ -169,9 +169,9 @@ def _make_press(
 
 
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make the procedure that presses the finger at all positions of the experiment.
+    """Make the coroutine that presses the finger at all positions of the experiment.
 
-    Before the first press, the procedure waits until the soft-body node uses a sufficiently
+    Before the first press, the coroutine waits until the soft-body node uses a sufficiently
     accurate table of deformations.
 
     method: soft-body method with the least accurate table that is sufficient.

@@ -96,7 +96,7 @@ def run_demo(
 def make_demo_procedures(
     bag: Path, progress: Progress, report: Report, path: FingerPath | None
 ) -> list[Procedure]:
-    """Make the procedures that run the experiments of the demo and evaluate each experiment."""
+    """Make the procedures (coroutines) that run the experiments of the demo and evaluate them."""
     made: list[Procedure] = []
 
     def add(procedure: Procedure, evaluate: Callable[[], DemoResult | None], name: str) -> None:

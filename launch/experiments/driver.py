@@ -1,8 +1,8 @@
 """Control a running graph during an experiment: move the simulated finger and set the display.
 
 The driver publishes with the writer name "tools" and subscribes to the topics that it evaluates.
-Every wait has a deadline. The timeout error names the awaited condition, the notes of the nodes and
-an overload of the computer.
+Every wait has a deadline. The timeout error names the awaited condition, the problems that the
+nodes report, and an overload of the computer.
 """
 
 from __future__ import annotations

@@ -5,8 +5,9 @@ limits. The linear program makes these assumptions:
 
 - The future of the finger is known. Therefore delays, tracking and prediction cause no error.
 - The sheet rolls on the undeformed object without slip, with a constant stretch.
-- Joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
-    limited as in the arm bridges. There is no servo lag and no limit on the jerk.
+- Limits apply to the positions, speeds and accelerations of the joints, and to the speed of the
+    ends of the clamped edges. The limits are those of the nodes that control the arms. There is
+    no servo lag and no limit on the jerk.
 - While there is no contact, the sheet can move freely.
 - Joint angles change linearly with small deviations of the contact point.
 

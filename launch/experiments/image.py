@@ -280,9 +280,7 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and maximum error (mm) of the object's visible size for each correction
-    method.
-    """
+    """Return mean and maximum error (mm) of the visible object size for each image correction."""
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),

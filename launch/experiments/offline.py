@@ -556,8 +556,7 @@ class OfflineEvaluator:
         return CrossErrors(places[seen_by_both], found[seen_by_both])
 
     def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
-        """Convert image errors (rows, columns, 2), in m, so that they refer to the true eye
-        position.
+        """Convert image errors (rows, columns, 2), in m, to the true eye position.
 
         The given errors are displacements from the correct image for the scene's eye position. The
         results are displacements from the correct image for the true eye position `eye` (3,).

@@ -200,7 +200,8 @@ def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     A summary contains the median, the 95 % quantile and the maximum of the metric, and the seed of
     the maximum. It also contains the number of trials that have the metric, and the number of
     trials that are out of tolerance. The key `not_flagged` is the number of trials out of tolerance
-    that no self-check flagged. If no trial has the metric, the statistics are None.
+    in which no node suspected an error of the hardware. If no trial has the metric, the statistics
+    are None.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

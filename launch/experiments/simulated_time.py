@@ -272,7 +272,7 @@ class SimulatedArm:
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge uses, which is measured or known in advance."""
+        """Return the servo lag (s), measured or known, that the node of the arm uses."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property
@@ -458,8 +458,8 @@ def follow_in_simulated_time(
     """Simulate the sheet's motion along a finger path, and return the errors of the sheet.
 
     The result has the keys of `FollowedFinger.figures`. The key `servo_lag_ms` contains the servo
-    lags that the two bridges have measured at the end. The key `servo_lag_uncertainty_ms` contains
-    their standard deviations.
+    lags that the control nodes of both arms have measured at the end. The key
+    `servo_lag_uncertainty_ms` contains their standard deviations.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)

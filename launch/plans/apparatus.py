@@ -55,9 +55,10 @@ class Draw:
 
 
 def parse_draw(text: str) -> Draw | None:
-    """Parse the value of `--apparatus`; return None if the value is a file name.
+    """Parse the value of --apparatus, the option that selects parameters of simulated hardware.
 
-    Raises BadInputError if the value starts with "seed:" but has a wrong format.
+    Return None if the value is a file name. Raises BadInputError if the value starts with "seed:"
+    but has a wrong format.
     """
     if not text.startswith("seed:"):
         return None

@@ -52,7 +52,7 @@ They are used for plans in older bags, which do not list calibrations.
 
 
 class ArmingMode(StrEnum):
-    """The values of the parameter `arming` of the arm bridge.
+    """The values of the parameter `arming` of the arm bridge (node that controls an arm).
 
     auto: the arm moves without a command.
     manual: the arm moves only after a command of the user.

@@ -79,7 +79,7 @@ class ForkServer:
     node_types: types of the nodes. If a type is defined outside this package, its module is not
         imported, because the module could start threads.
     config_files: configuration files of all processes that can be started.
-    lifeline: file descriptor that the nodes inherit.
+    lifeline: file descriptor of a pipe that the nodes inherit. When the pipe closes, the nodes end.
     log: file for the server's own output.
     """
 

@@ -384,7 +384,7 @@ def make_output(
 
 
 def has_estop(state: ArmState) -> bool:
-    """Return whether the bridge of an arm has engaged an e-stop."""
+    """Return whether the node that controls an arm has engaged an e-stop."""
     return state.mode == "estop" or state.estop_engaged
 
 

@@ -184,9 +184,10 @@ def _send_request(file: Path, request: bytes) -> socket.socket | None:
 
 
 def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Wait until `until_s` for launchers and arm bridges to confirm an emergency stop.
+    """Wait until `until_s` for confirmations of an emergency stop.
 
-    The receivers that confirm the stop are removed from `waiting` and returned.
+    The receivers are launchers and nodes that control an arm. The receivers that confirm the stop
+    are removed from `waiting` and returned.
 
     until_s: time of the monotonic clock, s.
     """
