@@ -212,9 +212,9 @@ def explained_by(error: Exception) -> str | None:
 
 
 def exit_code(error: Exception) -> int | None:
-    """Return the exit code of an error, or None if it is an error in the program.
+    """Return the exit code for an error that the user can correct.
 
-    All other errors can be corrected by the user.
+    Return None for any other error, because such an error is a bug in the program.
     """
     if isinstance(error, FlexsheetError):
         return error.exit_code

@@ -289,10 +289,10 @@ class Publisher:
             send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
-        """Read a batch of subscriptions, and send the stored message to these late subscribers.
+        """Read a batch of subscriptions, and send the stored message to new subscribers.
 
-        For a topic that is not latched, the socket reports only the first subscription and the end
-        of the last subscription.
+        If the topic is not latched, no message is stored. The subscriptions then only show whether
+        another process reads the topic.
         """
         if self._socket.closed or self._loop is None:
             return

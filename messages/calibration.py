@@ -112,7 +112,10 @@ class StereoCalibration(Part):
 
 
 def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) -> None:
-    """Raise CalibrationMismatchError unless device and image size agree with the scene."""
+    """Raise CalibrationMismatchError if a stereo calibration does not belong to the scene's camera.
+
+    The device and the image size are compared.
+    """
     if calibration.device != camera.device:
         raise CalibrationMismatchError(
             f'the calibration is of the camera "{calibration.device}", but the scene\'s camera is '

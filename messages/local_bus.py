@@ -150,7 +150,11 @@ class LocalBus:
         self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
 
     def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
-        """Return the channel of the first endpoint that has one, or None if no endpoint has one."""
+        """Return the message channel of an endpoint in this process.
+
+        If several endpoints have a channel, the channel of the first is returned. Return None if no
+        endpoint has a channel.
+        """
         return next((self._channels[one] for one in endpoints if one in self._channels), None)
 
 

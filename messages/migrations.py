@@ -177,7 +177,10 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
 
 
 def _literal_schema(model: str, recorded: Schema, current: Schema) -> Schema:
-    """Return a recorded JSON Schema in which text fields that became literals have the new type."""
+    """Return a recorded JSON Schema in which some fields have their current literal type.
+
+    These are the fields in TEXTS_TO_LITERALS, which contained text when old bags were recorded.
+    """
     properties = recorded.get("properties")
     if not isinstance(properties, Mapping):
         return recorded
@@ -210,7 +213,13 @@ def _rename_part(model: str, schema: Any) -> Any:
 
 
 def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
-    """Replace former literal values in the schema of a field, including those inside a union."""
+    """Replace former names of allowed values in the JSON schema of a field.
+
+    The values are in the keys `const` and `enum`. The options of a union (`anyOf`) are also
+    searched.
+
+    values: new names, by former name.
+    """
     if not values or not isinstance(schema, Mapping):
         return schema
     renamed = dict(schema)
@@ -257,7 +266,10 @@ def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the model class in an annotation, or None if it contains no or several models."""
+    """Return the pydantic model class that a type annotation contains.
+
+    Return None if the annotation contains no model class, or more than one.
+    """
     options = [annotation, *get_args(annotation)]
     models = [one for one in options if isinstance(one, type) and issubclass(one, BaseModel)]
     return models[0] if len(models) == 1 else None

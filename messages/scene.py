@@ -38,7 +38,7 @@ MAX_AXIS_ERROR = 1e-6
 class Part(MessagePart, LimitedModel):
     """The base class of the parts of scenes and calibrations.
 
-    Each number has a limit that depends on its unit.
+    The validation rejects a number that exceeds the limit for its unit.
     """
 
 
@@ -286,8 +286,8 @@ class VirtualObject(Part):
 class SheetSpec(Part):
     """The rubber sheet, clamped at its left and right edges and free at its top and bottom edges.
 
-    In the sheet frame, the x axis points from the left to the right edge, and the y axis points
-    along the edges.
+    In the sheet frame, the x axis points from the left to the right edge. The y axis points upwards
+    along the clamped edges.
     """
 
     width_m: Positive = Field(
@@ -444,8 +444,8 @@ ARM_MODELS = {arm.name: arm for arm in (RV_1A, RV_2FR)}
 class ArmSpec(Part):
     """A robot arm: its model, the pose of its base, and the pose of the sheet's edge on its flange.
 
-    In the sheet frame, the x axis points from the left to the right edge. The y axis points along
-    the edges, and the z axis points towards the user.
+    In the sheet frame, the x axis points from the left to the right edge. The y axis points upwards
+    along the clamped edges, and the z axis points towards the user.
     """
 
     model: Annotated[ClosedFormArm | JointChain, Field(discriminator="kind")] = Field(

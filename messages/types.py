@@ -149,7 +149,7 @@ If the reason is "concave_contact", the sheet follows the finger at a distance.
 
 
 class SheetTrajectory(MessagePart):
-    """The motion of the sheet after the time of its target pose, until a newer target arrives.
+    """The planned motion of the sheet after its target pose, if no newer target arrives.
 
     The sheet keeps the target's velocity (twist) for `keep_s`, and then decelerates uniformly to
     rest.
@@ -558,7 +558,11 @@ class ClockPing(Message):
 
 
 class ClockOffset(MessagePart):
-    """The time of another clock minus the time of the header's clock, at `at_ns`."""
+    """The offset between the clock of another computer and the clock of the message's header.
+
+    at_ns: time at which the offset was measured.
+    offset_ns: time of the other clock minus time of the header's clock.
+    """
 
     clock_id: str
     at_ns: int = Field(ge=0)

@@ -9,9 +9,9 @@ arrays of more than `json_channel.MAX_ARRAY` values. Images and 3D data become s
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
     object      the deformed surface of the soft body                     foxglove.SceneUpdate
 
-The axes of the world frame are x to the right, y up, and z towards the user. The time of a message
-is when it was recorded. Times count from 1970 if the bag contains the wall-clock time of its start.
-Otherwise, they count from the time when the recording computer was started.
+The axes of the world frame are x to the right, y up, and z towards the user. The timestamps in the
+exported file are the times of recording. They count from 1970 if the bag contains the wall-clock
+time of its start. Otherwise, they count from the time when the recording computer was started.
 """
 
 from __future__ import annotations

@@ -222,7 +222,10 @@ def _make_conversion(annotation: Any) -> Get:
 
 
 def _applied(get: Get, function: Callable[[Any], Any]) -> Get:
-    """Return a getter that applies `function` to the result of `get`, unless it is None."""
+    """Return a getter that applies `function` to each value that `get` returns.
+
+    If `get` returns None, the new getter also returns None.
+    """
 
     def apply(row: Any) -> Any:
         value = get(row)

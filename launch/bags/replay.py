@@ -158,8 +158,8 @@ def verify(
     progress: function that is called with the number of replayed messages and the total number of
         messages.
 
-    Raises BagError if the bag does not contain the node, its inputs or a valid launch file, or if
-    the node cannot be replayed.
+    Raises BagError if the node cannot be replayed, or if the bag does not contain the node, its
+    inputs or a valid launch file.
     """
     reader = BagReader(bag)
     plan = _read_plan(reader)
@@ -336,8 +336,9 @@ async def _replay_run(
 class NodeRun:
     """The execution log of a node, from one start of the node to the next start.
 
-    steps: integers (n, 4), one row for each executed step. The columns are input, sequence number,
-        epoch and time (ns). The input is its index, or -1 minus the index of a timer.
+    steps: integers (n, 4), one row for each call of a message handler or timer. For a message, the
+        columns are input index, sequence number, epoch (start time) of the writer, and call time
+        (ns). For a timer, the first column contains -1 minus the index of the timer.
     """
 
     clock_id: str
@@ -407,7 +408,9 @@ class RecordedInputs:
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """Return the message of an input port with the given sequence number and epoch.
+        """Return the message of an input port with the given sequence number.
+
+        epoch: start time of the node that sent the message.
 
         Return None if the bag does not contain the message.
         """

@@ -174,11 +174,13 @@ def read_detections(
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
     """Read the arm poses from a folder, and detect the calibration board in the images.
 
+    If the folder's pose table contains board poses instead of image names, the board corners are
+    computed by projection into both cameras.
+
     Return the detections. Also return (pose name, reason) for each pose in which the board was not
     detected.
 
-    rig: stereo camera. If the table contains board poses, the corners are projected into its
-        images.
+    rig: stereo camera.
     size: required (width, height) of the images, px.
 
     Raises ArmPosesError or BadInputError if the table is invalid, and CalibrationError if images

@@ -48,7 +48,10 @@ image's diagonal.
 
 
 class BinGroup(StrEnum):
-    """The groups of conditions (`Bin`), in the order in which the user is asked to meet them."""
+    """The types of conditions that the image pairs of a calibration must meet (`Bin`).
+
+    The user is asked to meet the conditions in the order of these types.
+    """
 
     TILT = "tilt"
     DISTANCE = "distance"
@@ -59,10 +62,13 @@ class BinGroup(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """A condition that a minimum number of image pairs must meet, such as a tilt of the board.
+    """A condition on an image pair, such as a certain tilt of the calibration board.
 
-    name: tilt or distance, one of `TILTS` or `DISTANCES`; empty if the group is neither.
-    cell: column and row of an image cell; None if the group is not a cell of an image.
+    A calibration needs a minimum number of image pairs that meet each condition.
+
+    name: required tilt (from `TILTS`) or distance (from `DISTANCES`) of the board; empty for other
+        conditions.
+    cell: column and row of the image cell that must contain the board; None for other conditions.
     """
 
     group: BinGroup
@@ -71,10 +77,11 @@ class Bin:
 
 
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
-    """Return the required number of image pairs for each condition, for a total of `pairs`.
+    """Return how many of `pairs` image pairs must meet each condition (`Bin`).
 
-    No pairs are required in the first column of cells in the left image and in the last column in
-    the right image. At most distances, only one camera sees the board there.
+    Each image is divided into a grid of cells, in which the board must appear. The first column of
+    the left image and the last column of the right image are exempt. At most distances, only one
+    camera sees the board in these columns.
     """
     count = max(1, round(0.1 * pairs))
     required = {Bin(BinGroup.PAIRS): pairs}
@@ -91,7 +98,7 @@ def compute_required_counts(pairs: int) -> dict[Bin, int]:
 
 @dataclass(frozen=True, slots=True)
 class PairAssessment:
-    """The decision about one image pair.
+    """The decision whether an image pair is used for the calibration.
 
     hint: instruction to the user for the next pose of the board.
     """

@@ -1,8 +1,7 @@
 """Evaluate a stereo calibration by measuring a board of known size.
 
 Errors are underestimated on image pairs that were used to calibrate. Therefore, `check_stereo`
-requires further pairs, and `cross_check` measures each pair with a calibration that does not use
-it.
+requires other pairs, and `cross_check` measures each pair with a calibration that does not use it.
 """
 
 from __future__ import annotations
@@ -72,14 +71,12 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class BoardMeasurement:
-    """The errors of a board that was measured with a stereo camera.
+    """The errors of a calibration board's corners, as measured with a stereo camera.
 
     squares_m: errors (m) of the distances between neighbouring corners.
     diagonals_m: errors (m) of the lengths of the diagonals.
-    rigid_fit_m: distances (m) of the measured corners from the fitted board.
+    rigid_fit_m: distances (m) of the measured corners from the board fitted to them.
     reprojection_px: distances (px) of the detected corners from the projected corners.
-
-    The arrays have different lengths.
     """
 
     squares_m: Floats
@@ -295,12 +292,12 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate a stereo calibration by measuring image pairs that it does not use.
+    """Cross-validate a stereo calibration with images of a calibration board.
 
-    The pairs are divided into groups. For each group, the camera is calibrated with all other
-    pairs, and the pairs of the group are measured. Consecutive pairs are in different groups,
-    because their images are similar. If the board is a chessboard, the calibration of OpenCV's
-    tutorials is evaluated in the same way, for comparison.
+    The image pairs are divided into groups. For each group, the camera is calibrated with all other
+    pairs. The board is then measured in the pairs of the group. Consecutive pairs are in different
+    groups, because their images are similar. If the board is a chessboard, the calibration method
+    of OpenCV's tutorials is evaluated in the same way, for comparison.
 
     leave_out: number of pairs in each group.
 

@@ -114,11 +114,11 @@ class StepResult(LimitedModel):
     advice: text that states what to do if the residual exceeds `limit`.
     uncertainty: standard deviations by name. Each name ends in the unit.
     scene_values: new values for the scene, by dotted path in the scene file.
-    parameters: names of calibration files in the folder. Each key TYPE.PARAMETER names a node type
-        and its parameter, which is set to the file name.
+    parameters: names of calibration files in the folder, by node parameter. Each key has the form
+        "NODE_TYPE.PARAMETER".
     node_values: measured values of other node parameters.
     missing: quantities that were not measured.
-    figures: further results.
+    figures: other results of the step, by name.
     covariances: covariance matrices by name, for the prediction of errors.
     """
 
@@ -140,7 +140,7 @@ class StepResult(LimitedModel):
 
 
 class StepRecord(LimitedModel):
-    """The record of one finished or skipped step of a commissioning."""
+    """The record of one finished or skipped step in the calibration of a laboratory."""
 
     name: StepName
     date: str
@@ -151,7 +151,7 @@ class StepRecord(LimitedModel):
 
 
 class State(LimitedModel):
-    """The state of a commissioning: its input files, and its finished and skipped steps."""
+    """The state of the calibration of a laboratory: input files, and finished and skipped steps."""
 
     version: Literal[1] = 1
     launch_file: str
@@ -372,7 +372,7 @@ MEASURED_IN_OPERATION = (
 
 
 def format_report(state: State) -> str:
-    """Return the report of a commissioning as Markdown.
+    """Return the report on the calibration of a laboratory as Markdown.
 
     The report contains residuals, uncertainties, predicted errors and the causes of the largest
     errors.
@@ -441,7 +441,11 @@ def format_verdict(state: State) -> list[str]:
 
 
 def is_good(state: State) -> bool:
-    """Return whether the verification is finished and found no reason for doubt."""
+    """Return whether the display errors in a laboratory are verified to be within the tolerances.
+
+    The verification must be finished. The function `list_doubts` must also have found no reason why
+    an error may exceed a tolerance.
+    """
     figures = _verification_figures(state)
     return bool(figures) and not figures.get("doubts")
 
@@ -529,7 +533,7 @@ def list_doubts(
     The list is empty if there are no reasons.
 
     figures: results of the step "verification".
-    tracking: sheet error (mm) that the devices report for the stroke of the finger, and the
+    tracking: mean measured error (mm) of the sheet while it follows a stroke of the finger, and the
         tolerance (mm) of this error.
     check_command: command line that repeats the verification.
     """

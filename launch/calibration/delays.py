@@ -1,9 +1,9 @@
 """Measure the delays of the arms and the camera.
 
 The servo lag is the time by which an arm lags behind its commands. The node that controls an arm
-measures the lag from commanded and measured joint angles. At its start, the node reads the expected
-lag from the launch file. Its self-check reports if the measured lag deviates from the expected lag.
-Therefore, the measured lag is written to the launch file.
+measures the lag from commanded and measured joint angles. The node also reads an expected lag from
+the launch file, and reports if the measured lag deviates from it. Therefore, the measured lag is
+written to the launch file.
 
 The stamp offset is the time of an exposure minus its timestamp. The camera sees the marks on both
 clamps while the arms move the sheet. The motion of the marks in the images is compared with the

@@ -247,7 +247,10 @@ def _draw_edges(scene: Scene, random: np.random.Generator) -> tuple[Floats, Floa
 
 
 def rest(position: Floats, _time_s: float) -> Floats:
-    """Return the position (3,) of a mark at rest, which does not depend on the time."""
+    """Return the position (3,) of a mark that does not move.
+
+    The simulated camera requires the position of a mark as a function of time.
+    """
     return position
 
 

@@ -164,7 +164,9 @@ def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
 def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Floats, float]:
     """Fit the position of one eye, starting from the position `start` (3,).
 
-    Return the position (3,), its covariance (3, 3), and the rms angle (rad) between bead and cross.
+    In each alignment, the viewer has moved a bead until it covers a projected cross for this eye.
+    Returns the position (3,) in m, its covariance (3, 3), and an rms angle (rad). The angle is
+    between the directions from the fitted eye to the bead and to the cross.
     """
     beads = np.array([one.bead_m for one in alignments])
     crosses = np.array([one.cross_m for one in alignments])
@@ -176,9 +178,13 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
         )
 
     def offsets(eye: Floats) -> Floats:
-        """Return the shortest vectors (n, 3), in m, from the lines of sight to the crosses.
+        """Return the vectors (n, 3), in m, from the lines of sight to the measured crosses.
 
-        eye: position (3,) of the eye.
+        Each vector is perpendicular to its line of sight, which passes through the eye and a bead.
+        If the eye position is exact, the line also passes through the cross on the sheet that
+        belongs to the bead.
+
+        eye: assumed position (3,) of the eye.
         """
         directions, far = beads - eye, crosses - eye
         directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -224,11 +230,13 @@ def read_alignments(path: Path) -> list[Alignment]:
 def simulate_alignments(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> list[Alignment]:
-    """Simulate the alignments of a viewer, as measured by the simulated stereo camera.
+    """Simulate how a viewer aligns a bead with crosses on the sheet, and measure the positions.
 
-    The arms hold the flat sheet at the origin of the world. An alignment is omitted if the viewer
-    does not see the sheet behind the bead. It is also omitted if the camera does not detect the
-    bead or the cross.
+    The alignment is simulated for each eye and several positions of the bead. The simulated stereo
+    camera measures the bead and the cross. The arms hold the flat sheet at the origin of the world.
+
+    The result omits an alignment if the viewer does not see the sheet behind the bead. It also
+    omits an alignment if the camera does not detect the bead or the cross.
 
     apparatus: true parameters of the simulated hardware.
     calibration: camera parameters for the detector. If None, the scene's parameters are used.

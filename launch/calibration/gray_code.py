@@ -122,7 +122,7 @@ def _bits(size_px: int) -> int:
 def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
     """Find the camera pixels that show n given projector pixels.
 
-    Return camera pixels (n, 2), and a mask (n,) that is true for each pixel that was found.
+    Return camera pixels (n, 2), and a mask (n,) of the pixels that were found.
 
     projector_px: given projector pixels (n, 2).
     """

@@ -249,12 +249,13 @@ class _Unknowns:
 
 @dataclass(frozen=True, slots=True)
 class _LinearizedPose:
-    """The residuals of the board corners in one arm pose, linearized at the current estimates.
+    """The measurements of the board corners in one arm pose, linearized at the current estimates.
 
-    measured: correction (6,) of the flange pose, in the flange's frame, that fits the corners best.
+    measured: correction (6,) of the flange pose that minimises the residuals of the corners, in the
+        flange's frame. It consists of a rotation (rad) and a translation (m).
     spread: covariance (6, 6) of `measured` if the corner noise is 1 px.
-    by_unknowns: derivatives (6, 12) of this correction with respect to corrections of the base pose
-        and the board pose.
+    by_unknowns: derivatives (6, 12) of `measured` with respect to corrections of the base pose and
+        the board pose.
     inner_px2: sum of the squared residuals that remain after the correction.
     count: number of corner coordinates.
     rms_px: rms residual of the corners before the correction.
@@ -506,7 +507,7 @@ def _solve_closed_form(
 
 
 def _unstack_rotation(stacked: Floats) -> Floats:
-    """Return the rotation (3, 3) that is nearest to a multiple of a matrix.
+    """Return the rotation (3, 3) that is nearest to a matrix of unknown scale and sign.
 
     stacked: columns of the matrix as one vector (9,).
     """
@@ -517,9 +518,10 @@ def _unstack_rotation(stacked: Floats) -> Floats:
 def _compute_discrepancies(
     unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Return the differences (n, 6) between n flange poses from joint angles and from images.
+    """Compare the flange poses from the images with the flange poses from the joint angles.
 
-    A difference is a rotation vector (rad) and a translation (m) in the frame of the flange.
+    Return a pose difference (6,) for each of n arm poses, as an array (n, 6). Each difference is a
+    rotation vector (rad) and a translation (m) in the flange's frame.
     """
     found = []
     for flange, board in zip(flanges, boards, strict=True):
@@ -552,9 +554,10 @@ class _NoiseModel:
     arm_m: float
 
     def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
-        """Return the weights (n, 6, 6) of the corrections of n flange poses.
+        """Return the weight matrices (n, 6, 6) of n measured flange poses for a least-squares fit.
 
-        A weight is the inverse of the covariance that results from the errors of corners and arm.
+        Each weight is the inverse of a covariance. The covariance results from the noise of the
+        detected corners and the errors of the arm.
         """
         arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in poses])
@@ -562,10 +565,11 @@ class _NoiseModel:
 
 
 def _find_inliers(poses: Sequence[_LinearizedPose], model: _NoiseModel) -> Bools:
-    """Return a mask (n,) that is true for each of the n poses that is not an outlier.
+    """Return a mask (n,) of the poses that are not outliers.
 
-    The mask is the result of a chi-square test of deviations that are scaled by their median. If a
-    deviation is as small as rounding errors, the pose is not an outlier.
+    An outlier deviates too much from the fit in a chi-square test. The squared deviations are first
+    divided by their median, to be robust against outliers. Deviations that are as small as rounding
+    errors are accepted.
     """
     measured = np.array([one.measured for one in poses])
     bounded = _NoiseModel(

@@ -156,10 +156,13 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     expected_m = np.array([TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M])
 
     def solve(logarithms: Floats) -> tuple[float, Floats, Floats, Floats]:
-        """Return the cost, the offset (3,), its covariance (3, 3), and the weighted residuals.
+        """Estimate the marker's offset for given standard deviations of the measurement errors.
 
-        logarithms: logarithms (3,) of the ratios of three standard deviations to the expected
-            values.
+        Return the cost, the offset (3,), its covariance (3, 3), and the weighted residuals.
+
+        logarithms: logarithms (3,) of three standard deviations, each divided by its expected
+            value. They describe the measurement noise, the common error in each orientation, and
+            the error of each touched point.
         """
         noise, turned, placed = (expected_m * np.exp(logarithms)) ** 2
         covariance = fixed + turned * same_orientation + placed * same_point

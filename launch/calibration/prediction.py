@@ -266,11 +266,12 @@ def draw_camera_errors(
 
 
 def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: Random) -> ArmTruth:
-    """Return random true parameters of an arm.
+    """Return random true parameters of an arm that are consistent with its calibration.
 
     arm: parameters without errors.
-    covariance: covariance (19, 19) from `fit_edges`. If it is None, the arm is returned unchanged.
-    seen_m: error (3,) of the position of the arm's clamp that the camera measured.
+    covariance: covariance (19, 19) of the parameters from `fit_edges`. If it is None, the arm is
+        returned unchanged.
+    seen_m: error (3,), in m, of the clamp's position if the stereo camera measures it.
     """
     if covariance is None:
         return arm

@@ -77,10 +77,10 @@ class ProjectorFit:
 
     held_out_rms_px: rms residual from cross-validation. Each sheet pose is compared with a fit to
         all other poses.
-    before_rms_px: rms residual of the initial projector.
+    before_rms_px: rms residual of the projector parameters before the calibration.
     coverage_ratio: fraction of the projected image that contains points.
-    shift_covariance_px2: covariance (2, 2) of the mean displacement of the image. The jackknife
-        computes it from fits that each omit one sheet pose.
+    shift_covariance_px2: covariance (2, 2) of the mean image displacement that results from the
+        calibration's error. It is estimated with the jackknife, by omitting each sheet pose once.
     """
 
     projector: Projector
@@ -257,7 +257,7 @@ def _fit_projector(points: ProjectorPoints, inliers: Bools, guess: Projector) ->
     the values of `guess`. OpenCV's fit is not used, because it rejects a principal point outside
     the image. If a projector has lens shift, its principal point is outside the image.
 
-    inliers: mask (n,) that is true for each of the n points to use.
+    inliers: mask (n,) that selects the points to use.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
@@ -319,9 +319,9 @@ def fit_keystone(
 ) -> ProjectorFit:
     """Fit a projector to the pixels that light the corners of a rectangle on the imaginary screen.
 
-    Many projectors light four given corners exactly, because the corners determine only a
-    homography. The result is the projector whose parameters are nearest to `guess`, with the same
-    lens distortion as `guess`.
+    The corners determine only a homography, so projectors with different parameters can light them
+    exactly. The result is the projector whose parameters are nearest to `guess`. Its lens
+    distortion is the same as in `guess`.
 
     corners_px: projector pixels (4, 2) of the corners bottom left, bottom right, top right and top
         left, as the user sees them.

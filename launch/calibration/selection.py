@@ -1,8 +1,7 @@
 """Select reliable image pairs and corners, and fit the stereo rig to them.
 
 Each camera is first fitted alone by Zhang's method (A flexible new technique for camera
-calibration, 2000). Then the parameters of both cameras are fitted together (module `bundle`). The
-result predicts unused images more accurately than a fit in which the lens parameters are fixed.
+calibration, 2000). Then the parameters of both cameras are fitted together (module `bundle`).
 """
 
 from __future__ import annotations
@@ -270,7 +269,10 @@ def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int
 
 
 def make_undetermined_error(pairs: int, reason: str) -> CalibrationError:
-    """Make the error for a number of `pairs` that do not determine the stereo rig."""
+    """Make the error for image pairs that do not determine the parameters of the stereo rig.
+
+    pairs: number of image pairs.
+    """
     return CalibrationError(
         f"the {pairs} pairs do not determine the rig ({reason}); change the tilt of the board "
         "between images"

@@ -1,6 +1,6 @@
 """Fit the sheet's force model to measured pushes.
 
-A push is a measured force of a finger that is pressed into the sheet to a known depth. The fit
+In a push, a finger is pressed into the sheet to a known depth, and its force is measured. The fit
 determines the stiffness of the rubber and the unstretched width of the sheet.
 """
 
@@ -80,18 +80,18 @@ class MeasuredPush:
 
 @dataclass(frozen=True, slots=True)
 class SheetModelFit:
-    """A fitted force model of the sheet, with its uncertainty.
+    """A force model of the sheet, fitted to n pushes, with its uncertainty.
 
     law: fitted force model, whose stretch ratios refer to the nominal width of the sheet.
     names, values, standard_deviations: names, values and standard deviations of the fitted
         parameters.
-    used: mask (n,) that is true for each of the n pushes that is not an outlier.
+    used: mask (n,) of the pushes that are not outliers.
     residual_ratio: measured force divided by fitted force, minus one (n,).
-    rms_ratio, worst_ratio: rms and largest magnitude of `residual_ratio`. Outliers and pushes whose
-        forces are similar to the noise are not included.
-    rms_sigmas: rms of the residuals divided by their assumed standard deviations. It is computed
-        for contact forces and for edge forces, and the larger value is used. The residual of an
-        outlier is limited to OUTLIER_SIGMAS.
+    rms_ratio, worst_ratio: rms and largest magnitude of `residual_ratio`. Outliers and pushes with
+        forces as small as the measurement noise are excluded.
+    rms_sigmas: rms residual in units of the assumed standard deviation. Contact forces and edge
+        forces are evaluated separately, and the larger value is used. The residual of an outlier is
+        limited to OUTLIER_SIGMAS.
     """
 
     law: ScaledSheetModel
@@ -343,13 +343,13 @@ def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m:
 def tabulate_pushes(
     law: ScaledSheetModel, pushes: Sequence[MeasuredPush], used: Bools, nominal_width_m: float
 ) -> TabulatedSheetModel:
-    """Make a table of the ratio of measured to modelled force, from the used pushes.
+    """Make a table of the ratio of measured to modelled force, from n measured pushes.
 
     The axes of the table are stretch, depth, and the distances of the push from the sheet's centre
     along x and y. Pushes must exist at every combination of stretch, x and y. The depths can differ
     between combinations. The ratios are interpolated at depths that all combinations cover.
 
-    used: mask (n,) that is true for each of the n pushes to use.
+    used: mask (n,) that selects the pushes to use.
 
     Raises SheetModelFitError if a combination is missing.
     """

@@ -218,11 +218,11 @@ def make_error_function(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> Callable[[Image, Image], Floats]:
-    """Return a function that computes the errors of the image that the user sees on the sheet.
+    """Return a function that computes the position errors of the image on a simulated sheet.
 
-    The arguments of the returned function are two projector images, which encode the x and the y
-    coordinate as brightness (coordinate ramps). The returned function computes the error (n,), in
-    m, at each of n points of the simulated sheet that the eye can see.
+    The returned function has two arguments. They are projector images in which the brightness
+    encodes the x and the y coordinate (coordinate ramps). The function returns the error (n,), in
+    m, at each of n points that the user's eye can see.
     """
     sheet = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m

@@ -127,13 +127,13 @@ def simulate_touches(
     calibration: StereoCalibration | None,
     seed: int,
 ) -> list[Touch]:
-    """Simulate touches of known points, as observed by the simulated stereo camera.
+    """Simulate touches of known points, and measure the finger's marker with the stereo camera.
 
-    First, the marker is measured in all orientations of `SIMULATED_TILTS_DEG`, relative to the
-    usual orientation of the finger. Then the finger touches each point in the orientations in which
-    the measured marker has the smallest uncertainty. The fit assumes that `direction_world` in the
-    scene is the usual orientation. The fitted offset is therefore valid during normal use. A touch
-    is omitted if the detector does not accept the marker.
+    The touches are the data for a fit of the marker's position relative to the fingertip. First,
+    the marker is measured at all finger tilts of `SIMULATED_TILTS_DEG`. The tilts are relative to
+    the usual orientation of the finger. Then the finger touches each point at the tilts at which
+    the measured marker has the smallest uncertainty. A touch is omitted if the detector does not
+    accept the marker.
 
     apparatus: true parameters of the simulated hardware.
     calibration: camera parameters for the detector. If None, the scene's parameters are used.

@@ -449,7 +449,10 @@ def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
 
 
 def require_twin(apparatus: str | None, *, simulated: bool) -> None:
-    """Raise CommandError if --apparatus is given without --twin."""
+    """Raise CommandError if the option --apparatus is given without --twin.
+
+    Both options concern simulated hardware.
+    """
     if apparatus is not None and not simulated:
         raise CommandError(f"--apparatus {apparatus}: the option is for --twin only; remove it")
 

@@ -211,7 +211,7 @@ def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
 
 
 def summarize(lab: Commissioning) -> dict[str, Any]:
-    """Return the state of a commissioning as the JSON output of `flexsheet commission --json`."""
+    """Return the state of a laboratory's calibration for `flexsheet commission --json`."""
     from flexsheet.launch.calibration.commission import APPARATUS_FILE, REPORT_FILE, StepName
 
     steps = []

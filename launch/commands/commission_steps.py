@@ -113,13 +113,13 @@ def open_laboratory(
     apparatus: str | None = None,
     **options: Any,
 ) -> tuple[Commissioning, Laboratory]:
-    """Open the folder of a commissioning; return its state and its devices.
+    """Open or create a folder for the calibration of a whole laboratory (commissioning).
 
-    If the devices are simulated, their true parameters are written to an apparatus file in the
-    folder.
+    Return the state of the calibration, and the devices of the laboratory. If the devices are
+    simulated, their true parameters are written to an apparatus file in the folder.
 
-    apparatus: apparatus file, or a random sample such as "seed:7". It is None if the devices are
-        real.
+    apparatus: apparatus file, or the specification of a random sample, such as "seed:7". None if
+        the devices are real.
     options: fields of `Laboratory`.
     """
     plan = load_graph(launch_file)
@@ -139,12 +139,14 @@ def open_laboratory(
 class Laboratory:
     """The devices of one laboratory: simulated devices, or files with the data of real devices.
 
-    apparatus: true parameters of simulated devices, in the world frame of the camera. It is None if
-        the devices are real.
-    data: for each step, the file or folder with the captured data.
+    apparatus: true parameters of simulated devices, or None if the devices are real. All poses
+        refer to the world frame in which the stereo camera has its pose from the scene.
+    data: file or folder with the data captured for each calibration step, for real devices.
+    board, flange_board: calibration boards for the stereo camera and for the arms.
     finger_radius_m: measured radius of the fingertip, for real devices.
     sheet_kg_per_m2: measured mass per area of a real sheet.
     seconds: duration of the finger's stroke in the verification.
+    seed: random seed of the simulation.
     simulated_time: whether to verify simulated devices in simulated time, without a running graph.
     pairs, arm_poses, sheet_poses: numbers of simulated image pairs, arm poses and sheet poses.
     """
@@ -525,8 +527,9 @@ class Laboratory:
     ) -> MeasuredLag:
         """Measure the time from the buffer swap of a frame to the middle of its display.
 
-        stamp: measured offset of the camera's timestamps. It is None if the offset is unknown.
-        added_s: part (s) of this offset for which the timestamps in the data are already corrected.
+        stamp: measured offset of the camera's timestamps; None if it is unknown.
+        added_s: offset (s) by which the timestamps in the data have already been corrected. Only
+            the difference between `stamp` and this offset is still corrected.
         """
         from flexsheet.launch.calibration.delays import MeasuredLag
         from flexsheet.launch.calibration.display_latency import (
@@ -554,7 +557,11 @@ class Laboratory:
         )
 
     def verify(self, lab: Commissioning) -> StepResult:
-        """Measure the errors during a stroke of the finger and, for simulated devices, at rest."""
+        """Verify the calibrations by measuring the display errors.
+
+        The errors are measured during a stroke of the finger. In a simulated laboratory, they are
+        also measured with a resting finger.
+        """
         from flexsheet.launch.bags.report.findings import BRIEFLY_BUSY_FRACTION
         from flexsheet.launch.calibration.prediction import predict_errors
 
@@ -726,9 +733,11 @@ def describe_sheet(
 ) -> dict[str, float]:
     """Return the parameters of a measured sheet as new values for a scene file.
 
-    Each key is a dotted path, such as `sheet.width_m`. The flange compliances are multiplied by the
-    tension of the scene's sheet and divided by the tension of the measured sheet. The tension then
-    displaces the flanges as far as the step `edges` measured.
+    Each key is a dotted path, such as `sheet.width_m`.
+
+    The step `edges` has measured how far the sheet's tension displaces the flanges. The measured
+    sheet has another tension than the sheet in the scene. The flange compliances are therefore
+    rescaled, so that the displacement remains as measured.
 
     modulus_thickness_n_per_m: product of Young's modulus and thickness.
     width_m: width without tension.

@@ -84,7 +84,8 @@ def hosts(
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
     """Check the hosts of the running graph; return an empty list if no graph is running.
 
-    If the graph runs on one host, only the findings of the nodes' self-checks are returned.
+    If the graph runs on one host, only the results of the nodes' own calibration checks are
+    returned.
     """
     from flexsheet.launch.health.doctor_hosts import SELF_CHECK
     from flexsheet.launch.running.runs import list_live_runs
@@ -100,10 +101,10 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved graph, and the run in which this computer executes the graph.
+    """Return the resolved graph of a launch file, and its run on this computer.
 
-    The run is None if the graph is not running. If `launch_file` is None, the newest running graph
-    is used.
+    A run is one execution of a graph. The result contains None instead of a run if the graph is not
+    running. If `launch_file` is None, the newest running graph is used.
     """
     from flexsheet.launch.plans.plan import load_graph
 

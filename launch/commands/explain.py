@@ -110,10 +110,14 @@ def _error_entries() -> list[Entry]:
 
 
 def find_entries(text: str) -> list[Entry]:
-    """Return the explanations of a code, a class name or a reported text.
+    """Return the explanations of an error or a note.
 
-    A text matches if it contains the name of an error class, or the phrase of a note or an error. A
-    phrase that is a part of another matching phrase is ignored. Longer phrases come first.
+    text: code of the error or note, name of the error class, or a text that a program has printed.
+        A printed text matches if it contains the name of an error class, or the characteristic
+        phrase of an error or a note.
+
+    If a matching phrase is part of another matching phrase, only the longer phrase is used.
+    Explanations with longer phrases are listed first.
     """
     code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
     if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:

@@ -239,7 +239,10 @@ def result_file(text: str, metavar: str = "FILE") -> Any:
 
 
 def check_folder(file: Path | None) -> Path | None:
-    """Return an output file; raise CommandError if its parent folder does not exist."""
+    """Check that the parent folder of an output file exists, and return the file's path.
+
+    Raises CommandError if the folder does not exist.
+    """
     if file is not None and not file.resolve().parent.is_dir():
         raise CommandError(f"{file}: the folder {file.parent} does not exist; create it")
     return file

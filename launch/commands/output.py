@@ -214,9 +214,10 @@ def print_result(result: Mapping[str, Any], *, as_json: bool) -> None:
 def _list_values(
     values: Mapping[str, Any], prefix: str = "", outer_unit: str = ""
 ) -> Iterator[tuple[str, str]]:
-    """Yield the label and the text of each value.
+    """Yield a label and a formatted text for each value in nested mappings.
 
-    The unit of a value is the suffix of its name. If the name has no unit, it is `outer_unit`.
+    The suffix of a value's name, such as `_m`, determines the unit. The unit of names without such
+    a suffix is `outer_unit`. Values that are None are omitted.
     """
     for name, value in values.items():
         suffix = next((one for one in UNITS if name.endswith(one)), "")

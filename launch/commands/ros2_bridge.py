@@ -17,7 +17,7 @@ app = options.make_app()
 
 
 class ExternalTopic(StrEnum):
-    """The topics that ROS nodes can be allowed to publish for flexsheet."""
+    """The flexsheet topics that ROS nodes may publish if the user permits this."""
 
     EYE = "eye"
     FINGERTIP = "fingertip"

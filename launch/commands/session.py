@@ -130,9 +130,9 @@ def _print_shown(plan: ResolvedGraph, shown: Run, live: Sequence[Run]) -> None:
 async def _collect_statuses(
     plan: ResolvedGraph, run: Run, statuses: dict[str, Status], hosts: dict[str, HostStatus]
 ) -> int:
-    """Receive the statuses of all nodes and hosts for at most STATUS_TIMEOUT_S; always return 0.
+    """Receive the statuses of all nodes and hosts for at most STATUS_TIMEOUT_S.
 
-    They are stored by name in `statuses` and `hosts`.
+    The statuses are stored by name in `statuses` and `hosts`. The result is the exit code 0.
     """
     handlers: dict[str, Callable[[Any], None]] = {
         "status": lambda message: statuses.update({message.node: message}),

@@ -100,7 +100,8 @@ class Press:
     """A press of the finger at a position on the object.
 
     place: name of the position.
-    place_m: distance (m) along the object, and arc length (m) around the object from its front.
+    place_m: coordinates (m) of the position on the object's surface, relative to the centre of the
+        front. The first is along the object, and the second is the arc length around the object.
     surface, normal: point (3,) and normal (3,) of the undeformed object at this position, in the
         world frame.
     holds: intervals in which the finger rests and the force is evaluated; empty if the finger moves
@@ -168,10 +169,12 @@ def _make_press(
 
 
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make the procedure that presses the finger at all positions of the experiment.
+    """Make the coroutine that presses the finger at all positions of the experiment.
 
-    method: least accurate method whose table is accepted. Before the first press, the procedure
-        waits until the soft body uses a table that is at least as accurate.
+    Before the first press, the coroutine waits until the soft-body node uses a sufficiently
+    accurate table of deformations.
+
+    method: soft-body method with the least accurate table that is sufficient.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -188,10 +191,11 @@ class ComplianceRecording:
     """The data of a compliance experiment, read from a bag.
 
     windows_ns: start and end (ns) of each finger path; the keys are the labels of the paths.
-    edges: true flange poses of both arms; each pose (4, 4) is stored as 16 numbers.
+    edges: true motions of the left and the right flange, which hold the edges of the sheet. Each
+        flange pose (4, 4) is stored as 16 numbers.
     curves: force curves published at `curve_times_ns`. A curve with m points is an array (m, 2) of
         depths (m) and object forces (N).
-    methods: the soft body's method that computed each curve.
+    methods: for each curve, the name of the soft-body method with which the curve was computed.
     forces: array (k, 2) of times (ns) and values (N) of the k valid measured contact forces.
     """
 
@@ -366,11 +370,14 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return n times (ns) in a press, and n ratios of the rubber's force to the elastic force.
+        """Compute how hysteresis and creep of the rubber change the force during a press.
 
-        The membrane is solved at a few depths only, with the poses of the edges at the deepest
-        point of the press. This is sufficient, because the ratio depends only on the shape of the
-        force curve.
+        Return n times (ns), and n ratios of the rubber's force to the force of a purely elastic
+        sheet.
+
+        The elastic force is computed at a few depths only, with the edge poses at the deepest point
+        of the press. This is sufficient, because the ratio depends only on the shape of the force
+        curve.
         """
         begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
         times = np.arange(begin_ns, end_ns + 1, round(HISTORY_STEP_S * 1e9))
@@ -459,12 +466,14 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 
 
 def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
-    """Return the mean force (N) that a gauge measured in a rest; None without a measurement.
+    """Return the mean force (N) that a force gauge measured while the finger rested.
 
-    The averaging interval is longer than the interval for the true force, because gauges are slow.
+    Return None if there are no measurements. The force is averaged over the last MEASURED_S of the
+    rest. The true force is averaged over a shorter time, but gauges respond slowly.
 
     forces: array (k, 2) of k times (ns) and forces (N).
     begin_ns: start of the finger path.
+    hold: interval in which the finger rests.
     """
     since_s = 1e-9 * (forces[:, 0] - begin_ns)
     chosen = forces[(since_s > hold.end_s - MEASURED_S) & (since_s < hold.end_s), 1]

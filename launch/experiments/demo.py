@@ -96,7 +96,7 @@ def run_demo(
 def make_demo_procedures(
     bag: Path, progress: Progress, report: Report, path: FingerPath | None
 ) -> list[Procedure]:
-    """Make the procedures that run the experiments of the demo and evaluate each experiment."""
+    """Make the procedures (coroutines) that run the experiments of the demo and evaluate them."""
     made: list[Procedure] = []
 
     def add(procedure: Procedure, evaluate: Callable[[], DemoResult | None], name: str) -> None:
@@ -139,9 +139,11 @@ def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
 
 
 def evaluate_path(bag: Path, label: str) -> DemoResult | None:
-    """Evaluate the finger path that has the given label.
+    """Evaluate how the sheet followed a finger path, and write the results and a figure to files.
 
     Return None if the bag does not yet contain the path.
+
+    label: label of the finger path.
     """
     if not is_path_recorded(bag, label):
         return None
@@ -153,7 +155,9 @@ def evaluate_path(bag: Path, label: str) -> DemoResult | None:
 
 
 def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
-    """Return the errors with which the sheet followed the finger path that has the given label.
+    """Return the sheet's errors while it followed a finger path, from a bag.
+
+    label: label of the finger path.
 
     Raises ExperimentError if the bag does not contain the path.
     """

@@ -1,8 +1,8 @@
 """Control a running graph during an experiment: move the simulated finger and set the display.
 
 The driver publishes with the writer name "tools" and subscribes to the topics that it evaluates.
-Every wait has a deadline. The timeout error names the awaited condition, the notes of the nodes and
-an overload of the computer.
+Every wait has a deadline. The timeout error names the awaited condition, the problems that the
+nodes report, and an overload of the computer.
 """
 
 from __future__ import annotations
@@ -95,7 +95,9 @@ PROGRESS_PERIOD_S = 5.0
 
 @dataclass(slots=True)
 class Waiter:
-    """A wait for a condition, with a deadline that frames from the renderer postpone.
+    """A pending wait for a condition, with a deadline.
+
+    Each frame that the renderer publishes postpones the deadline, up to a limit.
 
     seconds: time (s) to wait after the start, and after each frame that postpones the deadline.
     latest_s: latest deadline, in the time of the event loop.
@@ -221,11 +223,11 @@ class Driver:
 
         description: name of the condition in the error text.
         seconds: time to wait.
-        max_frames: number of renderer frames that restart the wait.
+        max_frames: maximum number of renderer frames that restart this time.
         max_seconds: limit of the total time.
+        error: class of the error that is raised if the condition is not met in time.
 
-        Raises `error` if the condition is not met in time, or OverloadedError if a computer is
-        overloaded.
+        Raises OverloadedError instead if a computer is overloaded.
         """
         if condition():
             return
@@ -251,10 +253,12 @@ class Driver:
     def make_timeout_error(
         self, what: str, error: type[ExperimentError] = ExperimentError
     ) -> ExperimentError:
-        """Return the error of a wait that took too long; its text contains the notes of the nodes.
+        """Make an error that reports a timeout and the status notes of all nodes.
 
-        what: first part of the error text. error: type of the error, unless a computer is
-            overloaded.
+        If a computer is overloaded, the result is an OverloadedError that names the overload.
+
+        what: first part of the error text.
+        error: type of the error if no computer is overloaded.
         """
         busy = [text for host in self._hosts.values() if (text := describe_busy(host))]
         notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
@@ -423,7 +427,10 @@ class Driver:
 
 
 def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
-    """Return whether a solver node uses a table for a scene, and computes a missing table."""
+    """Return whether a solver node requires a precomputed table of deformations for a scene.
+
+    If such a table is missing, the node computes it.
+    """
     method, _ = choose_method(
         scene,
         parameters.method,

@@ -5,8 +5,9 @@ limits. The linear program makes these assumptions:
 
 - The future of the finger is known. Therefore delays, tracking and prediction cause no error.
 - The sheet rolls on the undeformed object without slip, with a constant stretch.
-- Joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
-    limited as in the arm bridges. There is no servo lag and no limit on the jerk.
+- Limits apply to the positions, speeds and accelerations of the joints, and to the speed of the
+    ends of the clamped edges. The limits are those of the nodes that control the arms. There is
+    no servo lag and no limit on the jerk.
 - While there is no contact, the sheet can move freely.
 - Joint angles change linearly with small deviations of the contact point.
 
@@ -107,10 +108,11 @@ class LimitedMotion:
 def find_least_deviation(
     motion: LimitedMotion, weights: Floats, step_s: float, *, max_deviation: float
 ) -> Floats | None:
-    """Find the motion with the least weighted mean deviation from a nominal motion.
+    """Find the motion within the limits that deviates least from a nominal motion.
 
-    Return the lengths (n,) of the deviations; their weighted mean is a lower bound. Return None if
-    no motion fulfils the limits.
+    Return the length (n,) of the deviation at each of n time steps. The weighted mean of these
+    lengths is a lower bound for the mean deviation of every motion within the limits. Return None
+    if no motion is within the limits.
 
     weights: (n,), weights of the n time steps.
     step_s: time step.
@@ -217,7 +219,7 @@ class RolledSheet:
 
 
 class FollowedContact:
-    """A model of a sheet that follows a finger exactly, and of small deviations from its motion."""
+    """A model of a sheet that exactly follows a finger, and of small deviations from its path."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))
@@ -234,9 +236,11 @@ class FollowedContact:
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
-        """Return the sheet after it has rolled over the object to each of n finger positions.
+        """Roll the sheet over the object without slip, and return its pose at n finger positions.
 
-        positions_world: finger positions (n, 3), m. The sheet starts at the front of the object.
+        The sheet starts at the front of the object, and rolls from one position to the next.
+
+        positions_world: finger positions (n, 3), m.
         """
         object_from_world = inverse(self._world_from_object)
         front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))
@@ -261,11 +265,16 @@ class FollowedContact:
         return sheet.rolled_to(found.point, found.normal)
 
     def limit(self, sheets: Sequence[RolledSheet], reachable: list[bool]) -> LimitedMotion:
-        """Return joint angles and positions of the edge ends as linear functions of the deviations.
+        """Linearize the motion of the arms for small displacements of the contact.
 
-        The three deviations (m) of the contact are along the sheet's x and y on the object, and
-        along its normal. For each nominal sheet, the method appends to `reachable` whether the arms
-        reach it. The values of unreachable sheets are NaN.
+        The result contains the joint angles and the positions of the ends of the clamped edges,
+        with their limits. They are linear functions of three displacements (m) of the contact
+        point. The displacements are along the sheet's x axis, along its y axis, and along its
+        normal.
+
+        sheets: nominal sheet at each time step.
+        reachable: list to which the method appends whether the arms reach each sheet. For a sheet
+            that is out of reach, the values in the result are NaN.
         """
         joints = np.full((len(sheets), 4, 2, 6), np.nan)
         ends = np.full((len(sheets), 4, 2, 2, 3), np.nan)
@@ -327,12 +336,15 @@ def bound_errors(
     *,
     apparatus: Apparatus | None = None,
 ) -> dict[str, Any]:
-    """Return a lower bound of the contact error for a finger path, in mm.
+    """Return a lower bound of the contact error (mm) along a finger path.
 
-    The result contains the mean and the 95 % quantile (p95) for the motion with the least mean.
-    Only time steps in which the finger touches the object are included. The error counts as zero
-    where the arms cannot reach the exact pose, and in windows with fewer than 3 steps or no
-    solution.
+    The bound is computed for the motion with the least mean error that is possible within the
+    limits of the arms. The result contains the mean and the 95 % quantile (p95) of its errors. Only
+    time steps in which the finger touches the object are counted.
+
+    The path is divided into windows that are solved independently. Errors count as zero in a window
+    without a solution or with fewer than 3 steps. They also count as zero where the arms cannot
+    reach the exact pose.
 
     times_s: n increasing times.
     positions_world: (n, 3), true fingertip positions, m.

@@ -48,7 +48,8 @@ class ReferenceForceCurve:
     def force(self, depth_m: float) -> ReferenceForce | None:
         """Return the force at a depth, or None if the depth is outside the range of the curve.
 
-        A depth is accepted if it exceeds a limit of the range by at most 1 % of the limit.
+        The accepted range is slightly larger: its lower limit is 1 % lower, and its upper limit is
+        1 % higher.
         """
         if not 0.99 * self._depths_m[0] <= depth_m <= 1.01 * self._depths_m[-1]:
             return None

@@ -197,11 +197,12 @@ def read_gestures(bag: Path) -> GestureRecording:
 def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
     """Return the jumps (n-1,) between consecutive position estimates, in standard deviations.
 
-    A jump is the difference of two errors, so it does not contain the finger's motion. The standard
-    deviation is taken along the jump; the estimates are assumed to be independent.
+    A jump is the change of the position error from one estimate to the next. The finger's motion is
+    therefore excluded. Each jump is divided by its standard deviation in the direction of the jump.
+    The errors of different estimates are assumed to be independent.
 
-    errors: (n, 3), errors of the n estimates, m.
-    covariances: (n, 3, 3), covariances of the estimates, m^2.
+    errors: errors (n, 3) of the n estimates, m.
+    covariances: covariances (n, 3, 3) of the estimates, m^2.
     """
     jumps = np.diff(errors, axis=0)
     lengths = np.linalg.norm(jumps, axis=1)
@@ -284,9 +285,12 @@ def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
 
 
 def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
-    """Return the largest jump between fingertips, and the number of jumps above the limit SIGMAS.
+    """Summarize the jumps between consecutive position estimates of the fingertip.
 
-    errors: (n, 3), errors of the n fingertips, m.
+    Return the largest jump in standard deviations and in mm, and the number of jumps above SIGMAS
+    standard deviations.
+
+    errors: (n, 3), errors of the n position estimates, m.
     """
     if len(tips) < 2:
         return {"max_sigmas": None, "max_mm": None, "beyond_3_sigmas": 0}

@@ -169,9 +169,12 @@ HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
 
 @dataclass(frozen=True, slots=True)
 class FeltForce:
-    """The felt force and the object's force at the finger's depth.
+    """The force that a finger feels, and the force of the virtual object at the same depth.
 
-    Each array has one element per time step. `wanted_n` is the force of the object.
+    Each array has one element per time step.
+
+    felt_n: force of the sheet on the finger.
+    wanted_n: force of the virtual object at the depth `depths_m` of the finger.
     """
 
     times_s: Floats
@@ -181,7 +184,7 @@ class FeltForce:
 
 
 def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) -> FeltForce:
-    """Compute the felt force and the object's force during a recorded touch.
+    """Compute the sheet's force on the finger and the virtual object's force during a touch.
 
     curve: (n, 2), n pairs of depth (m) and force (N) of the object.
     """

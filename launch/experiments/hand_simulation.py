@@ -72,14 +72,15 @@ class Cases:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The result of a simulation of n hands.
+    """The result of a simulation of n hands, which are released near their equilibrium.
 
     decay_per_s (n,): decay rate of the oscillation between the second and the last quarter of the
         time; infinite if the oscillation has decayed completely.
     amplitude_m (n,): amplitude in the last quarter.
-    energy_ratio (n,): largest energy that the sheet delivers to the finger in any 2 s, relative to
-        the energy at release. The energy from a passive sheet is subtracted, and the first eighth
-        of the time is ignored.
+    energy_ratio (n,): maximum energy that the sheet delivers to the finger in any 2 s. It is
+        divided by the elastic energy of the displacement from which the finger is released. The
+        energy that a passive elastic sheet would deliver is subtracted. The first eighth of the
+        time is ignored.
     """
 
     decay_per_s: Floats
@@ -102,10 +103,10 @@ class Motion:
 
 
 class HeldOffset:
-    """A control loop with a filter and a delay that computes the sheet's offset from finger depths.
+    """A simulated control loop that sets the sheet's offset along its normal from the finger depth.
 
-    Until the next offset takes effect, the sheet continues to move at its last rate, as the real
-    arms do.
+    A filter and a delay are simulated. Until a new offset takes effect, the sheet continues to move
+    at its last rate, as the real arms do.
     """
 
     def __init__(self, cases: Cases, offset: Curve, period_s: float, step_s: float) -> None:

@@ -85,13 +85,13 @@ def push_path(
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """An image experiment in which one quantity varies.
+    """An image experiment in which one quantity, such as the push depth, varies.
 
-    key: result column of the quantity.
-    name: format string that makes the name of a case from the value.
-    path: function that makes the finger path for a value.
-    sizes: function that measures sizes (m) of the cylinder in an image.
-    size_names: symbols of the sizes in the paper.
+    key: name of the varied quantity in the results.
+    name: format string that makes the name of a case from the value of the quantity.
+    path: function that makes the finger path for a value of the quantity.
+    sizes: function that measures the sizes (m) of the cylinder in an image.
+    size_names: symbols of these sizes in Furukawa et al. 2007.
     values: default values of the quantity.
     """
 
@@ -118,7 +118,7 @@ PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (
 
 
 def make_push_series(along_mm: float, tilt_deg: float) -> Series:
-    """Return the push experiment at a position on the side of the cylinder.
+    """Return a series of simulated pushes with increasing depth at a position on the cylinder.
 
     along_mm: position along the axis, measured from the centre.
     tilt_deg: angle around the axis, measured from the front.
@@ -140,12 +140,18 @@ They are used to measure the image error at all visible points.
 
 
 def make_pattern_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the image that shows a pattern in the simulated case `label`."""
+    """Return the label of an image that shows a pattern.
+
+    label: label of the simulated case.
+    """
     return f"{label}, {pattern}"
 
 
 def make_eyes_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the images, one per eye, of a pattern in the simulated case `label`."""
+    """Return the label of the images that show a pattern to each eye separately.
+
+    label: label of the simulated case.
+    """
     return f"{make_pattern_label(label, pattern)}, both eyes"
 
 
@@ -193,7 +199,13 @@ def size_errors_mm(
 
 
 def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
-    """Compute the errors of the visible image points in a case, from the images of both ramps."""
+    """Compute the position errors of the image points that the eye sees in a simulated case.
+
+    The errors are computed from two images of coordinate ramps. A coordinate ramp is a pattern
+    whose brightness encodes the x or the y coordinate.
+
+    label: label of the case.
+    """
     x, y = (find_recorded(images, "image", make_pattern_label(label, pattern)) for pattern in RAMPS)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
@@ -241,7 +253,9 @@ def make_rows(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> list[dict[str, Any]]:
-    """Return the results of an image experiment, with one row per value and correction.
+    """Return the results of an image experiment as table rows.
+
+    There is one row for each value of the varied quantity and each image correction.
 
     with_maps: whether to add mean, 95 % quantile and maximum of the errors at all visible points.
     with_eyes: whether to add the errors of both eyes and of the disparity.
@@ -266,7 +280,7 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum size error (mm) of each correction method."""
+    """Return mean and maximum error (mm) of the visible object size for each image correction."""
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),

@@ -1,26 +1,26 @@
 """Measure the Weber fraction of stiffness with an adaptive staircase, and store its trials.
 
-In each trial, the participant pushes two objects and names the stiffer object. One of them is the
-reference, and the other one is stiffer by the relative increment d. The probability of a correct
-answer is
+In each trial, the participant pushes two objects in succession, and names the stiffer one. One
+object is the reference, and the other one is stiffer by the relative increment d. The probability
+of a correct answer is
 
     p(d) = lapse / 2 + (1 - lapse) * Phi(ln(1 + d) / sigma +- bias),
 
 with the normal distribution function Phi (Green & Swets, Signal detection theory, 1966). The lapse
 rate is the fraction of trials that are answered at random. Sigma is the standard deviation of the
-perceived difference of two log stiffnesses. The bias is a preference for the second interval. It is
-added if the second interval has the stiffer object, and subtracted otherwise. The Weber fraction w
-is the increment at which 75 % of the answers would be correct if there were no lapses and no bias.
-Therefore ln(1 + w) = 0.674 sigma.
+perceived difference of two log stiffnesses. The bias is a preference for the second object of a
+trial. The bias is added if the second object is stiffer, and subtracted if the first object is
+stiffer. The Weber fraction w is the increment at which 75 % of the answers would be correct if
+there were no lapses and no bias. Therefore ln(1 + w) = 0.674 sigma.
 
 Each trial uses the increment that gives the least expected entropy of the posterior of w. This is
-the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown
-lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w is
-inversely proportional to the square root of the number of trials; `docs/jnd.md` states the
-measured error.
+the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999). The posterior is marginalised
+over the unknown lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard
+deviation of ln w is inversely proportional to the square root of the number of trials;
+`docs/jnd.md` states the measured error.
 
-The trials are stored in a CSV file, which is the only state of a session. After an interruption,
-all stored answers are replayed.
+The trials are stored in a CSV file. An interrupted session is continued from the answers in this
+file.
 """
 
 from __future__ import annotations
@@ -83,8 +83,9 @@ class StaircaseEstimator:
     def add(self, increment: int, stiffer: int, correct: bool) -> None:
         """Update the posterior with the answer of one trial.
 
-        increment: index in INCREMENTS. stiffer: interval (1 or 2) that contained the stiffer
-        object. correct: whether the participant named this interval.
+        increment: index in INCREMENTS.
+        stiffer: number (1 or 2) of the stiffer object, in the order of presentation.
+        correct: whether the participant named this object.
         """
         likely = self._correct[stiffer][increment]
         self._posterior = self._posterior * (likely if correct else 1.0 - likely)
@@ -95,7 +96,7 @@ class StaircaseEstimator:
 
         With this increment, the posterior after the answer has the least expected entropy.
 
-        stiffer: interval (1 or 2) that contains the stiffer object.
+        stiffer: number (1 or 2) of the stiffer object, in the order of presentation.
         """
         right = np.einsum("swn,wn->sw", self._correct[stiffer], self._posterior)
         expected = _expected_entropy(right) + _expected_entropy(self._marginal - right)
@@ -149,13 +150,13 @@ class SessionPlan:
 
 @dataclass(frozen=True, slots=True)
 class PairTrial:
-    """A trial with a pair of objects of different stiffness.
+    """A trial in which two objects of different stiffness are presented in succession.
 
     number: number of the trial, from 1.
     increment: index in INCREMENTS.
-    stiffer: interval with the stiffer object, 1 or 2.
-    moduli_pa: Young's moduli in both intervals.
-    catch: whether the trial checks attention.
+    stiffer: number (1 or 2) of the stiffer object, in the order of presentation.
+    moduli_pa: Young's moduli of both objects, in the order of presentation.
+    catch: whether this is a catch trial, which checks the participant's attention.
     """
 
     number: int
@@ -167,12 +168,12 @@ class PairTrial:
 
 @dataclass(frozen=True, slots=True)
 class PairAnswer:
-    """The answer of the participant, with measurements of both intervals.
+    """The answer of the participant in a trial, with measurements of both pushes.
 
-    stiffer: interval that the participant named, 1 or 2.
-    response_s: time from the end of the second interval to the answer.
-    depths_m, forces_n: maximum push depth and maximum measured force in each interval; None if
-        there is no measurement.
+    stiffer: number (1 or 2) of the object that the participant named.
+    response_s: time from the end of the second push to the answer.
+    depths_m, forces_n: maximum push depth and maximum measured force for each object; None if there
+        is no measurement.
     """
 
     stiffer: int
@@ -215,9 +216,9 @@ class StaircaseSession:
     """
 
     def __init__(self, plan: SessionPlan, file: Path, *, now: Callable[[], str]) -> None:
-        """Start a session, or continue the session of an existing file.
+        """Start a new session. If `file` exists, continue the session that the file contains.
 
-        now: function that returns the present time as text.
+        now: function that returns the current date and time as text.
         """
         self.plan, self.file, self._now = plan, file, now
         self.estimator = StaircaseEstimator()

@@ -126,9 +126,12 @@ async def open_terminal() -> Ask:
 
 
 def make_jnd_procedure(run: Callable[[PairPresenter], Awaitable[None]]) -> Procedure:
-    """Make a procedure for `run_experiment` that presents pairs of objects in the graph.
+    """Make a procedure (coroutine) that presents pairs of objects to a participant.
 
-    run: coroutine function that runs the session with the given presenter.
+    `run_experiment` runs the procedure in a graph.
+
+    run: coroutine function that runs the session. Its argument is the presenter, which sets the
+        stiffness of the object in the running graph.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:

@@ -27,8 +27,11 @@ def estimate_lag_s(
     them at all shifts within +-max_lag_s. A parabola through the best shift and its neighbours
     refines the result. Mean and linear trend are removed from both motions, since in uniform motion
     a lag cannot be distinguished from an offset. If parts of the motion have different lags, the
-    parts with larger motion dominate. Example: ten seconds at 60 Hz with 0.5 mm of motion per axis.
-    The standard error is 0.6 ms with white noise of 0.1 mm, and 1.9 ms with noise of 0.3 mm.
+    parts with larger motion dominate.
+
+    As an example, the motion lasts ten seconds, is sampled at 60 Hz, and has an rms value of 0.5 mm
+    per axis. The standard error of the lag is then 0.6 ms with white noise of 0.1 mm, and 1.9 ms
+    with noise of 0.3 mm.
 
     times_s: n increasing times; their differences need not be equal.
     follower, leader: positions at these times, m, with shape (n,), or (n, k) for k axes.

@@ -80,7 +80,10 @@ UNIT_COVARIANCE_PX2 = np.eye(2)
 
 
 class Metric(StrEnum):
-    """The names of the evaluated errors in the results."""
+    """The types of errors that are evaluated.
+
+    Each value is the key of the error in the results, and ends in the error's unit.
+    """
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -133,10 +136,11 @@ class Evaluation:
         }
 
     def change_from(self, other: Evaluation) -> dict[str, float | None]:
-        """Return each metric's mean difference from another evaluation of the same simulated cases.
+        """Return the change of each metric from another evaluation of the same simulated cases.
 
-        Errors of single vectors, pixels and pushes are subtracted before averaging. Therefore
-        errors common to both evaluations cancel. The units are those of `figures`.
+        The errors of both evaluations are subtracted for each contact point, pixel and push. The
+        differences are then averaged, so errors that both evaluations have in common cancel. The
+        method `figures` states the unit of each metric.
         """
         image = None
         if self.image_m is not None and other.image_m is not None:
@@ -192,7 +196,11 @@ class CrossErrors:
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return the mean, maximum, per-eye and disparity errors (mm) of the crosses."""
+        """Return the errors (mm) of the drawn crosses as statistics over all crosses.
+
+        The mean and the maximum are computed from the average of both eyes. The result also
+        contains the mean error of each eye and the mean error of the horizontal disparity.
+        """
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {
@@ -220,7 +228,9 @@ class Contact:
 
 
 class OfflineEvaluator:
-    """An evaluator of the errors of apparatuses (true hardware parameters) in one scene.
+    """A model that computes the display errors in one scene without running the nodes.
+
+    The errors are computed for given sets of true hardware parameters (apparatuses).
 
     metres_per_px: resolution of the images.
     cells: number of mesh intervals per side of the true sheet.
@@ -310,7 +320,7 @@ class OfflineEvaluator:
         The sheet starts in contact with the front of the object.
 
         around_m: arc length around the object from the front to the new contact point.
-        aside_m: distance from the front to the new contact point, to the right.
+        aside_m: distance that the contact point moves to the right.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))
@@ -318,9 +328,11 @@ class OfflineEvaluator:
 
     @staticmethod
     def _lay_sheet(point: Floats, normal: Floats, on_sheet_m: Floats) -> Contact:
-        """Return the contact of a sheet with the given normal (3,) at a surface point (3,).
+        """Place a sheet tangent to the object at a surface point, and return the contact.
 
-        on_sheet_m: coordinates (3,) of the contact point on the sheet.
+        point: surface point (3,) in the world.
+        normal: unit normal (3,) of the sheet.
+        on_sheet_m: coordinates (3,) of the contact point in the sheet's frame.
         """
         x_axis = np.array([1.0, 0.0, 0.0]) - normal * normal[0]
         x_axis /= np.linalg.norm(x_axis)
@@ -382,8 +394,9 @@ class OfflineEvaluator:
     ) -> Floats:
         """Return the error (3,) of the sheet's contact point, in m, in the world frame.
 
-        The error is the object point under the true finger minus the contact point. The arms move
-        the sheet to the measured finger.
+        The error is the vector from the contact point of the sheet to the object point under the
+        true finger. The error occurs because the arms move the sheet to the measured finger, and
+        because the true hardware deviates from the scene.
 
         tip_error: measured minus true fingertip (3,).
         """
@@ -477,10 +490,10 @@ class OfflineEvaluator:
         return self._correct_parallax(errors, eye)
 
     def _estimate_sheet(self, edges: tuple[Floats, Floats], finger_tip: Floats | None) -> SheetPose:
-        """Return the sheet that the renderer assumes between resting edges.
+        """Return the pose of the sheet that the renderer computes from the poses of resting edges.
 
-        edges: poses (4, 4) of the edges. finger_tip: position (3,), m; None if no finger touches
-        the sheet.
+        edges: poses (4, 4) of the left and the right clamped edge.
+        finger_tip: position (3,), m; None if no finger touches the sheet.
         """
         height_m = self._scene.sheet.height_m
         sheet = estimate_sheet(*edges, height_m=height_m, finger_tip=finger_tip)
@@ -488,11 +501,13 @@ class OfflineEvaluator:
         return sheet
 
     def compare_crosses(self, apparatus: Apparatus) -> CrossErrors:
-        """Compare crosses drawn at expected contact points with the actual contact points.
+        """Compute the errors between projected crosses and the actual contact points.
 
-        Each cross marks a point of the object, and is drawn on the sheet for each eye. The sheet
-        then moves to a finger that touches it at the measured position of the cross. Raises
-        ExperimentError if the touched point cannot be computed.
+        Each cross marks an expected contact point of the object, and is projected onto the sheet
+        for each eye. The finger then moves to the expected contact point, and the sheet follows the
+        measured finger. An error is the vector from the actual contact point to the cross, as seen
+        by the eye. Raises ExperimentError if a contact point cannot be computed, or if all crosses
+        miss the sheet.
         """
         scene = apply_apparatus(self._scene, apparatus)
         arms = ArmPair(self._scene, apparatus)
@@ -541,10 +556,10 @@ class OfflineEvaluator:
         return CrossErrors(places[seen_by_both], found[seen_by_both])
 
     def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
-        """Convert image errors (rows, columns, 2), in m, to errors relative to the true eye.
+        """Convert image errors (rows, columns, 2), in m, to the true eye position.
 
-        The errors are measured relative to the image that the eye of the scene should see. From the
-        true eye position, the same object points should appear elsewhere on the screen plane.
+        The given errors are displacements from the correct image for the scene's eye position. The
+        results are displacements from the correct image for the true eye position `eye` (3,).
         """
         believed_eye = self._scene.eyes.centre_world_m
         if np.array_equal(eye, believed_eye):

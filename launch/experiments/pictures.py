@@ -186,7 +186,12 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_stability(result: dict[str, Any], path: Path) -> None:
-    """Draw the fraction of stable hands against stiffness and delay, one panel per control loop."""
+    """Draw in how many simulated cases the control loop of sheet and hand is stable.
+
+    Each panel shows one kind of control loop. Its colours show the fraction of stable cases against
+    the stiffness of the object and the delay. The last panel compares simulated and predicted
+    stability limits.
+    """
     rows = [*result["rows"], *result["without_bounds"]]
     kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})

@@ -12,7 +12,7 @@ LOOPBACK = "127.0.0.1"
 
 
 def choose_ports(launch_file: Path) -> list[str]:
-    """Return launch settings that give the simulated arms and their bridges free TCP ports.
+    """Return launch settings that give free TCP ports to simulated arms and to their control nodes.
 
     If the graph has no simulated arms, the list is empty.
     """

@@ -1,6 +1,7 @@
-"""Evaluate the system with many random apparatuses (true parameters of the simulated hardware).
+"""Evaluate the system with many random sets of true hardware parameters.
 
-An apparatus represents a laboratory whose hardware differs randomly from its scene file.
+Each set represents a laboratory whose simulated hardware deviates randomly from the scene file. The
+set is called an apparatus.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def apparatus_text(seed: int, profile: Profile, *, calibrated: bool) -> str:
-    """Return the value of the option --apparatus that selects random true hardware parameters."""
+    """Return a value of the option --apparatus that makes the hardware parameters random."""
     return f"seed:{seed},{profile.value}{',calibrated' if calibrated else ''}"
 
 
@@ -66,12 +67,12 @@ def run_robustness(
     keep_bags: bool = False,
     commissioned: bool = False,
 ) -> dict[str, Any]:
-    """Run one trial per seed, and return the results of `experiment robustness --json`.
+    """Evaluate a random laboratory per seed; return the results of `experiment robustness --json`.
 
-    commissioned: whether each simulated laboratory is calibrated first, in a separate folder. Then
-        it is evaluated in simulated time with the resulting scene and launch file. The apparatus
-        (true hardware parameters) has the errors of uncalibrated hardware, and the calibrated
-        camera defines the world frame.
+    commissioned: whether each simulated laboratory is calibrated before the evaluation. If true,
+        the true hardware initially has the errors of uncalibrated devices, and a separate folder
+        contains the calibrated scene and launch file. The evaluation then runs in simulated time,
+        and the calibrated camera defines the world frame.
     """
     if commissioned and calibrated:
         raise ExperimentError(
@@ -199,7 +200,8 @@ def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     A summary contains the median, the 95 % quantile and the maximum of the metric, and the seed of
     the maximum. It also contains the number of trials that have the metric, and the number of
     trials that are out of tolerance. The key `not_flagged` is the number of trials out of tolerance
-    that no self-check flagged. If no trial has the metric, the statistics are None.
+    in which no node suspected an error of the hardware. If no trial has the metric, the statistics
+    are None.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

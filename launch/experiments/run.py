@@ -65,7 +65,7 @@ def require_scene(plan: ResolvedGraph) -> Scene:
 
 
 async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
-    """Start a graph, run the procedure, and stop the graph.
+    """Start a graph, run an experiment's procedure (coroutine) on it, and stop the graph.
 
     Raises the errors of the procedure, and NodeFailedError if a node fails permanently.
     """
@@ -118,7 +118,7 @@ def run_experiment(
     without: Collection[Feature] = (),
     check_scene: Callable[[Scene], object] = lambda scene: None,
 ) -> None:
-    """Run a procedure on the graph of a launch file.
+    """Run an experiment's procedure (coroutine) on the graph of a launch file.
 
     bag: file to which all topics are recorded, or None if nothing is recorded.
     check_scene: function that raises an error if the experiment does not support the scene.
@@ -158,7 +158,9 @@ async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
 
 
 def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """Return the launch setting "NODE.parameter=value" for all nodes of a type or a derived type.
+    """Return launch settings that set a parameter of all nodes of a type, including derived types.
+
+    Each setting has the form "NODE.parameter=value".
 
     setting: text "parameter=value".
     """
@@ -169,7 +171,7 @@ def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
 def make_stroke_procedure(
     seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
 ) -> Procedure:
-    """Make a procedure that moves the finger along strokes, or along a given path.
+    """Make a procedure (coroutine) that moves the finger along strokes, or along a given path.
 
     seconds: durations of the finger's strokes, s.
     path: finger path that replaces the strokes.
@@ -188,7 +190,10 @@ def make_stroke_procedure(
 
 
 def make_switch_procedure(count: int, progress: Progress) -> Procedure:
-    """Make a procedure that switches the projected image `count` times between white and black."""
+    """Make a procedure (coroutine) that switches the projected image between white and black.
+
+    count: number of switches.
+    """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         random = np.random.default_rng(SWITCH_SEED)
@@ -214,11 +219,14 @@ def make_image_procedure(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> Procedure:
-    """Make a procedure that captures an image of each simulated case (value and correction method).
+    """Make a procedure (coroutine) that captures images of the sheet.
 
-    with_maps: whether to take images of coordinate ramps, from which the errors at all visible
-        points are computed.
-    with_eyes: whether to take images for each eye separately.
+    There is one image for each value of a varied quantity and each image correction.
+
+    values: values of the quantity that the experiment `series` varies.
+    with_maps: whether to also take images of coordinate ramps, whose brightness encodes a
+        coordinate. The errors at all visible points are computed from these images.
+    with_eyes: whether to also take images of coordinate ramps for each eye separately.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -242,7 +250,11 @@ def make_image_procedure(
 
 
 def make_table_procedure(progress: Progress) -> Procedure:
-    """Make a procedure that waits until the soft body uses a precomputed table."""
+    """Make a procedure (coroutine) that waits until a table of deformations is used.
+
+    The procedure controls the running graph. The table contains precomputed solutions of the
+    nonlinear deformation of the object. The node of the soft body interpolates them.
+    """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         await driver.wait_for_table(scene, "quick_table", progress)
@@ -251,7 +263,7 @@ def make_table_procedure(progress: Progress) -> Procedure:
 
 
 def chain_procedures(*procedures: Procedure) -> Procedure:
-    """Make a procedure that runs several procedures in sequence on the same graph."""
+    """Make a procedure (coroutine) that runs several procedures in sequence on the same graph."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for each in procedures:
@@ -263,7 +275,7 @@ def chain_procedures(*procedures: Procedure) -> Procedure:
 def make_evaluation(
     evaluate: Callable[[], Result | None], report: Callable[[Result], None], name: str
 ) -> Procedure:
-    """Make a procedure that evaluates a finished experiment while the graph still runs.
+    """Make a procedure (coroutine) that evaluates a finished experiment while the graph still runs.
 
     evaluate: function that reads the bag and returns the result; None if the recorder has not yet
         written the experiment.

@@ -30,8 +30,8 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 class EvaluationKind(StrEnum):
     """The method by which the effect of a parameter was evaluated.
 
-    OFFLINE: no motion is simulated. The errors of sheet and fingertip are evaluated at the working
-        speed, and the errors of image and force at rest.
+    OFFLINE: errors are computed for single poses, without running nodes. The errors of sheet and
+        fingertip include the effect of wrong timestamps at the working speed.
     SIMULATED_TIME: the errors of sheet and fingertip are evaluated during strokes of the finger in
         simulated time.
     NOT_MEASURED: the parameter affects only images of a moving sheet or eye.
@@ -166,14 +166,15 @@ def _make_row(
     evaluation: EvaluationKind,
     effects: Mapping[str, Mapping[str, float | None]] | None,
 ) -> Row:
-    """Return the effects of one deviation of a parameter.
+    """Return a result row with the effects of one deviation of a parameter.
 
-    The effect on a metric is None if the metric was not evaluated.
-
-    At rest, an effect is the mean change of single vectors, pixels and pushes. In simulated time,
-    an effect is the mean error minus the mean error with the nominal hardware parameters.
+    The row contains one effect for each error metric; None if the metric was not evaluated.
+    `Evaluation.change_from` defines the effects that are evaluated offline. In simulated time, an
+    effect is the mean error minus the mean error with the nominal hardware parameters.
 
     sigma: size of the deviation, in standard deviations.
+    effects: effects on the metrics, by the text of `sigma`; None if the parameter was not
+        evaluated.
     """
     row: Row = {"parameter": parameter, "sigma": sigma, "evaluation": evaluation.value}
     row |= {metric.value: None for metric in Metric}
@@ -186,9 +187,11 @@ def _make_row(
 
 
 def rank(scene: Scene, rows: Sequence[Row]) -> list[Row]:
-    """Return the measured parameters, sorted by their worst effect at a deviation of one sigma.
+    """Return the parameters, sorted by their worst effect at a deviation of one standard deviation.
 
-    The key `share` is the effect divided by the scene's tolerance of the metric.
+    Each result is a dictionary with the keys `parameter`, `share` and `metric`. The value `share`
+    is the largest error divided by its tolerance in the scene, and `metric` is the type of this
+    error.
     """
     limits = metric_tolerances(scene)
     ranked = []

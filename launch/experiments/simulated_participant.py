@@ -1,7 +1,8 @@
 """Simulate a participant of the stiffness experiment, in order to test the estimator.
 
 The participant perceives the logarithm of each stiffness with normally distributed noise, prefers
-one interval, and sometimes answers at random. The estimator does not know these parameters.
+the first or the second object, and sometimes answers at random. The estimator does not know these
+parameters.
 """
 
 from __future__ import annotations
@@ -60,9 +61,10 @@ class SimulatedParticipant:
         self.perception = perception or draw_perception(seed)
 
     def answer(self, trial: int, first_pa: float, second_pa: float) -> int:
-        """Return the interval (1 or 2) in which the object appears stiffer.
+        """Return the number (1 or 2) of the object that appears stiffer.
 
-        trial: number of the trial. first_pa, second_pa: Young's moduli of the objects.
+        trial: number of the trial.
+        first_pa, second_pa: Young's moduli of the objects.
         """
         random = np.random.default_rng((self._seed, SEED_STREAM, trial))
         mind = self.perception

@@ -106,7 +106,8 @@ class LoopSettings:
     """The settings of a simulation run.
 
     planner: parameters of the planner, with their names as keys.
-    lag_known: whether the bridges know the true servo lag of the arms; otherwise they measure it.
+    lag_known: whether the nodes that control the arms know the true servo lag; otherwise they
+        measure it.
     computing_s: time from the end of the camera's read-out to the published target.
     calibrations: calibrated parameters that the nodes use. If None, the nodes know camera, marker
         and exposure times exactly.
@@ -146,10 +147,12 @@ class MeasuredFinger:
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Measure the finger at a timestamp, and return its predicted positions (n, 3), in m.
+        """Simulate a measurement of the finger, and return its predicted positions (n, 3), in m.
+
+        The simulated cameras expose their images slightly after the timestamp `at_ns`.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
-            timestamp, (3,). The images are exposed slightly later.
+            timestamp, (3,).
         """
         truth, random = self._truth, self._random
         late_s = truth.stamp_offset_s - self._stamp_offset_s
@@ -229,7 +232,10 @@ class FilmedFinger:
 
 
 class SimulatedArm:
-    """A simulated arm: the control methods of its bridge, and the servo model of the simulator."""
+    """A simulated arm with a servo model, commanded by the methods of the arm bridge.
+
+    The arm bridge is the node that controls an arm.
+    """
 
     def __init__(
         self,
@@ -266,7 +272,7 @@ class SimulatedArm:
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge uses, which is measured or known in advance."""
+        """Return the servo lag (s), measured or known, that the node of the arm uses."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property
@@ -452,8 +458,8 @@ def follow_in_simulated_time(
     """Simulate the sheet's motion along a finger path, and return the errors of the sheet.
 
     The result has the keys of `FollowedFinger.figures`. The key `servo_lag_ms` contains the servo
-    lags that the two bridges have measured at the end. The key `servo_lag_uncertainty_ms` contains
-    their standard deviations.
+    lags that the control nodes of both arms have measured at the end. The key
+    `servo_lag_uncertainty_ms` contains their standard deviations.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
@@ -609,11 +615,13 @@ def touch_in_simulated_time(
     bounds: OffsetBoundsTable,
     settings: LoopSettings | None = None,
 ) -> TouchRecording:
-    """Simulate a hand that moves along a voluntary path while the sheet pushes the finger.
+    """Simulate a hand that touches the sheet while the sheet's force displaces the finger.
 
+    path: voluntary path, along which the finger would move without the force of the sheet.
     curve: (n, 2), n pairs of depth (m) and force (N) of the object.
-    make_finger: function that makes the simulated finger from its voluntary path.
-    bounds: the planner's bounds on the sheet's offset.
+    make_finger: function that makes the simulated finger and hand from the voluntary path.
+    bounds: limits of the sheet's offset along its normal, within which the planner keeps the
+        control loop stable.
     """
     voluntary = validate_path(path.times_s, path.positions_world_m, path.joined_by)
     compliance = ComplianceController(

@@ -1,15 +1,16 @@
 """Evaluate whether a hand that touches the sheet is stable: `flexsheet experiment stability`.
 
-The sheet's offset (its depth) depends on the finger depth; the slope is the ratio of their changes.
-Two simulations run in the time domain, without running nodes:
+To render a force, the planner moves the sheet along its normal by an offset that depends on the
+finger depth. The slope is the change of the offset divided by the change of the depth. Two
+experiments are simulated in the time domain, without running nodes:
 
 - boundary: the critical slope, above which a random hand is not stable. It is compared with the
-    prediction from the eigenvalues of the sampled control loop (`nodes.models.hand_loop`).
+  prediction from the eigenvalues of the sampled control loop (`nodes.models.hand_loop`).
 - map: the stability with the offset that the planner uses for objects of several stiffnesses.
-  Random hands, delays, packet jitters and depths are combined, with and without the planner's
-  bounds.
+  Random hands are combined with several delays, jitters of the delay, and depths. The planner's
+  stability limits of the offset are either used or not.
 
-The random hands are sampled from the ranges in the literature with a separate seed. The bounds are
+The random hands are sampled from the ranges in the literature with a separate seed. The limits are
 therefore tested with hands that were not used to derive them.
 """
 
@@ -126,7 +127,8 @@ class Trial:
 def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
     """Return the simulated cases of all combinations of trials and gains.
 
-    The cases of one trial are consecutive.
+    The gain multiplies the sheet's motion around the equilibrium. The cases of one trial are
+    consecutive.
     """
 
     def repeat(values: Iterable[float]) -> Floats:
@@ -146,10 +148,12 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
 
 
 def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Floats:
-    """Return the smallest slope of the offset at which the hand of each trial becomes unstable.
+    """Return the smallest slope at which the hand of each trial becomes unstable.
 
-    The result is NaN for a hand that is stable up to a slope of 1.5. The sheet is linear. All
-    trials must have the same period.
+    The slope is the change of the sheet's offset divided by the change of the finger depth. The
+    force of the sheet is proportional to its indentation. The result is NaN if the hand is stable
+    up to a slope of 1.5, or unstable already at the smallest tested slope. All trials must have the
+    same camera period.
 
     towards_finger: whether the slopes are negative, so that the sheet moves towards the finger.
     """
@@ -170,7 +174,12 @@ def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Fl
 
 
 def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[dict[str, Any]]:
-    """Return simulated and predicted critical slopes, with one row per hand and control loop."""
+    """Compare simulated with predicted stability limits, and return table rows.
+
+    The limit is the critical slope: the change of the sheet's offset per change of the finger depth
+    above which a hand is unstable. There is one row per hand and control loop for which the
+    simulation finds a limit.
+    """
     hands = draw_hands(settings.hands, settings.seed)
     rows: list[dict[str, Any]] = []
     for rate_hz, towards in product(settings.rates_hz, (True, False)):
@@ -233,10 +242,15 @@ def measure_map(
 ) -> list[dict[str, Any]]:
     """Simulate random hands that push objects of several stiffnesses; return table rows.
 
-    There is one row per object, hand, delay, jitter and kind of control loop. "bounded" is the
-    planner's control loop. "unbounded" has no stability bounds and no depth filter. "predicted"
-    also predicts the depth over the delay. The planner knows the mean delay. The jitter adds half
-    of its range to the delay.
+    There is one row per object, hand, delay, jitter and kind of control loop. The kinds are:
+
+    - "bounded": the planner's control loop, with stability limits of the sheet's offset and a
+      filter of the finger depth.
+    - "unbounded": a control loop without limits and filter.
+    - "predicted": as "unbounded", but with the depth extrapolated over the delay.
+
+    The jitter is a random additional delay. The planner's limits are computed for the mean delay,
+    which is the constant delay plus half of the maximum jitter.
     """
     material = scene.object.material
     if material is None:
@@ -330,8 +344,9 @@ def stability_result(
 ) -> dict[str, Any]:
     """Simulate hands on the sheet; return the result of `flexsheet experiment stability --json`.
 
-    The first simulation measures the critical slope above which a hand is not stable. The second
-    simulation tests whether hands are stable with objects of several stiffnesses.
+    The first simulation finds the critical slope, above which a hand is unstable. The slope is the
+    change of the sheet's offset divided by the change of the finger depth. The second simulation
+    tests whether hands are stable with objects of several stiffnesses.
     """
     boundary = measure_boundary(settings, progress)
     rows = measure_map(scene, model, curve, settings, progress)

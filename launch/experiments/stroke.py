@@ -2,8 +2,10 @@
 
 This is the experiment of Furukawa et al. 2007, section V and Table I. D is the point of the object
 nearest to the finger, and D' is the contact point of the sheet. The errors (Fig. 9) are the
-distance delta d from D to D', and the angle delta theta between the normals at D and D'. "Light" is
-the time at which the projector shows an image.
+distance delta d from D to D', and the angle delta theta between the normals at D and D'.
+
+The experiment also measures latencies from a camera exposure to later events. One of these events,
+called "light", is the display of an image by the projector.
 """
 
 from __future__ import annotations
@@ -88,7 +90,8 @@ class DrawnFrames:
 
     fingertip: drawn fingertip position (3,), m.
     sheet: centre (m) and normal of the drawn sheet, (6,).
-    deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
+    deformation_ages: age (s) of the finger measurement from which the drawn deformation was
+        computed, (1,).
     """
 
     fingertip: list[tuple[int, Floats]]
@@ -218,16 +221,15 @@ class StrokeRecording:
     """The data of a stroke experiment, read from a bag.
 
     fingertip, measured, finger: filtered, measured and true position of the fingertip.
-    windows_ns: start and end (ns) of each finger path; the keys are the labels of the paths.
-    measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
-        y axis and z axis of an edge in the world frame.
-    delays_s: delays from the centre of an exposure to the events that it caused; the keys are the
-        kinds of events.
-    drops: number of lost or refused messages, without those that a `latest` reader skipped.
+    windows_ns: start and end (ns) of each finger path, by label of the path.
+    measured_edges, true_edges: motion of the left and the right clamped edge of the sheet. Each row
+        (9,) contains the centre, y axis and z axis of an edge in the world frame.
+    delays_s: delays from the centre of an exposure to its effects, by kind of effect.
+    drops: number of lost or refused messages. Messages that a node skips because it needs only the
+        latest one are not counted.
     apparatus: origin of the true parameters of the simulated hardware.
-    surface, true_surface: shape of the unloaded sheet according to the scene, and according to the
-        apparatus.
-    loads: times (ns) of load reports of the computers, and whether the computer was overloaded.
+    surface, true_surface: shape of the unloaded sheet in the scene and in the simulated hardware.
+    loads: time (ns) of each load report of a computer, and whether the computer was overloaded.
     """
 
     scene: Scene
@@ -267,9 +269,10 @@ def frame_events(frame: Frame, published_ns: int) -> list[tuple[LatencyEvent, in
 
 
 def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, int, int]]:
-    """Return those events in a message for which a latency is measured.
+    """Return the events in a message whose latency is measured from a camera exposure.
 
-    An event is a tuple: kind, time of the exposure that caused the event (ns), event time (ns).
+    Each event is a tuple: kind, time (ns) of the exposure that caused the event, and time (ns) of
+    the event.
     """
     exposure_ns = header.source_ns
     match message:
@@ -431,12 +434,14 @@ def compute_sheet_planes(
 
 
 def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Floats]:
-    """Return the contact points D' (n, 3), in m, of a sheet on a cylinder, and their angles (n,).
+    """Return the sheet's contact points on a cylinder, and the directions of the sheet's normals.
 
-    For each of n positions x on the cylinder axis, D' is the nearest point of the sheet's plane.
-    The angle (rad) is the direction of the plane's normal around the axis.
+    The contact point D' is the point of the sheet's plane that is nearest to a point on the axis of
+    the cylinder. Return n contact points (n, 3), in m, in the object's frame. Also return n angles
+    (n,), in rad, of the plane's normal around the axis.
 
-    x_m: positions x (n,), m, in the object's frame.
+    planes: n planes of the sheet.
+    x_m: positions (n,) of n points on the axis, m, in the object's frame.
     """
     normal = planes.normals
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
@@ -454,9 +459,11 @@ Flatter surfaces have many points with nearly the same normal.
 def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
     """Return n contact points D' (n, 3), in m, of a sheet on an object of any shape.
 
-    D' is the surface point that has the plane's normal, projected onto the plane. Along a direction
-    in which the surface is not curved, D' has the position of the object point that is nearest to
-    the finger. The error of this approximation is of second order in the angle between the normals.
+    The sheet is tangent to the object at the surface point whose normal equals the normal of the
+    sheet's plane. This point is computed from the surface curvatures, and projected onto the plane.
+    Along a direction without curvature, the point is not unique, so the object point nearest to the
+    finger is used. The error of this approximation is of second order in the angle between the
+    normals.
 
     foot: points of the object nearest to the finger.
     centre, normal: (n, 3), point and normal of the sheet's plane.
@@ -484,9 +491,12 @@ def sheet_errors(
 ) -> tuple[Floats, Floats]:
     """Return the sheet's errors delta d (n,), in m, and delta theta (n,), in rad, at n times.
 
-    The errors are relative to the surface at the commanded depth of the sheet. Therefore the push
-    depth is not an error. On a cylinder, delta theta is the angle about its axis, as in Furukawa et
-    al. 2007. On other shapes, delta theta is the angle between the normals.
+    Delta d is the distance from the object point at the finger to the contact point of the sheet.
+    The planner can lower the sheet below the undeformed surface to render a soft object. This
+    commanded depth does not count as an error.
+
+    On a cylinder, delta theta is the angle about its axis, as in Furukawa et al. 2007. On other
+    shapes, delta theta is the angle between the normals.
 
     finger, edges: motions of the fingertip and of both clamped edges.
     normal_offset_m: (n,), commanded depth of the sheet below the undeformed surface.
@@ -516,11 +526,11 @@ def sheet_errors(
 
 
 def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
-    """Smooth the measured positions from the first to the last of `times_ns`.
+    """Smooth measured positions offline, from the first to the last of `times_ns`.
 
     A cubic smoothing spline is fitted to each coordinate by generalized cross-validation. The
-    spline also uses later measurements. Therefore its error estimates a lower bound for the error
-    of causal filters.
+    spline uses earlier and later measurements. A causal filter, which uses only earlier
+    measurements, is expected to have a larger error.
     """
     inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
     times, values = measured.times_ns[inside], measured.values[inside]
@@ -642,9 +652,10 @@ def compute_arcs(
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Return arc lengths (n, 2), in m, around the cylinder at n times.
+    """Return two positions around the cylinder at n times, as arc lengths (n, 2), in m.
 
-    The columns belong to the contact line of the sheet and to `points`.
+    The first column contains the position of the sheet's contact line. The second column contains
+    the position of `points`. Arc lengths are zero in the direction of the object's z axis.
 
     edges: motions of both clamped edges.
     points: n points (n, 3), m, in the world frame.
@@ -723,9 +734,11 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
 
 
 def compute_busy_fraction(recording: StrokeRecording, seconds: float) -> float | None:
-    """Return the fraction of load reports in a finger stroke that state an overload.
+    """Return the fraction of load reports during a finger stroke that report an overload.
 
-    Return None if there are no reports.
+    The computers of the graph send load reports. Return None if there are no reports.
+
+    seconds: duration of the stroke.
     """
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
     busy = [one for at_ns, one in recording.loads if begin_ns <= at_ns <= finish_ns]

@@ -99,9 +99,11 @@ def _make_ablations(
 
 
 def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Path:
-    """Write a launch file with a cylinder of another radius, and return its path.
+    """Write a scene and a launch file with another radius of the cylinder.
 
-    The front of the cylinder does not move. Relative paths become absolute.
+    Return the path of the launch file. The cylinder is moved, so that its front stays at the same
+    position. Relative paths are replaced by absolute paths, because the new files are in another
+    folder.
     """
     graph = load_graph(launch_file)
     added_m = radius_m - require_cylinder(require_scene(graph)).radius_m
@@ -183,10 +185,10 @@ def _trial_name(variant: Variant, number: int) -> str:
 
 
 def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
-    """Summarize the errors, latencies and lost messages of repeated finger strokes.
+    """Summarize the display errors, latencies and lost messages of repeated finger strokes.
 
-    The result also contains the number of strokes and the errors of failed strokes. The errors are
-    summarized as in `summarize_means`.
+    The function `summarize_means` defines the statistics of the display errors. The result also
+    contains the number of successful strokes, and the error texts of failed strokes.
     """
     good = [row for row in rows if "error" not in row]
     result: dict[str, Any] = {

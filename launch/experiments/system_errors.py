@@ -134,7 +134,7 @@ class ErrorEvaluator:
         contains the fraction of the sheet's mean square error that each stage of `STAGES` causes.
 
         methods: all methods of the configuration.
-        planner: further parameters of the planner.
+        planner: values of further planner parameters, by parameter name.
         """
         has_image, has_force = self.scene.projector is not None, self.scene.object.material
         moving = (methods.marker, methods.tracking, *planner.items())
@@ -244,9 +244,12 @@ class RestingPush:
         self._planner = SheetTrajectoryPlanner(scene, settings)
 
     def rest_at(self, tip: Floats, surface: Floats) -> SheetMotion:
-        """Return the planned sheet motion after the finger has rested at a point.
+        """Let the finger rest at a point, and return the sheet motion that is then planned.
 
-        tip: fingertip (3,), m. surface: point (3,) of the object at the first contact, m.
+        If the finger is not in contact yet, it first touches the object at `surface`.
+
+        tip: fingertip (3,), m.
+        surface: point (3,) of the object, m.
         """
         if not self._planner.in_contact:
             self._rest(surface)
@@ -279,13 +282,17 @@ def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
 
 
 def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:
-    """Return the sheet's error at n times, split into errors (3, n, 3), in m, of the three STAGES.
+    """Split the sheet's error at n times into the errors of three stages.
 
-    The total error is the difference of two points in the object's frame. The first is the object's
-    point nearest to the true finger, moved inward by the commanded offset (n, 1). The second is the
-    contact point of the true sheet. A displacement of a flat sheet along a flat object does not
-    change the contact. For flat objects, the total error is therefore only the distance between the
-    planes.
+    The stages are the measurement of the fingertip, planner and arms, and the geometry of the arms.
+    The result (3, n, 3) contains the error vectors (m) in the object's frame. Their sum is the
+    total error: the desired contact point minus the contact point of the true sheet. The desired
+    contact point is the object's point nearest to the true finger, moved inward by the offset.
+
+    If the object is flat, only the distance between sheet and object is an error. A displacement of
+    the sheet within its plane does not change the contact.
+
+    offsets_m: commanded offsets (n, 1).
     """
     world_from_object = object_pose(recording.scene)
     object_from_world = inverse(world_from_object)

@@ -122,8 +122,9 @@ def evaluate_stroke(bag: Path) -> dict[str, Any]:
 def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats]:
     """Return the delays (s) from exposures to arm commands, and from exposures to displayed images.
 
-    Only exposures between `begin_ns` and `end_ns`, and only the first effect of an exposure, are
-    used. The display time is corrected by the true latency of the projector.
+    Only exposures between `begin_ns` and `end_ns` are used. If an exposure causes several commands
+    of the same arm or several images, only the first is used. The display times are corrected by
+    the true latency of the projector.
     """
     to_arm: dict[tuple[str, int], float] = {}
     to_light: dict[int, float] = {}

@@ -88,7 +88,10 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
 
 
 def read_flags(bag: Path) -> list[SuspectedCause]:
-    """Return the error causes that nodes suspected in a bag, without repetitions, in time order."""
+    """Read from a bag which causes of errors the self-checks of the nodes suspected.
+
+    Each cause is listed once, in the order of the first report.
+    """
     found: dict[SuspectedCause, None] = {}
     for _, message, _, _ in BagReader(bag, topics=["status"]):
         if isinstance(message, Status):
@@ -190,10 +193,10 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the changes of the display errors that deviations of one hardware parameter cause.
+    """Return how much given deviations of one hardware parameter change the display errors.
 
     No graph is run. If the trial has `stroke_seeds`, the errors are measured during strokes of the
-    finger in simulated time. Otherwise, they are measured at rest.
+    finger in simulated time. Otherwise, they are computed by `OfflineEvaluator`.
     """
     plan = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
     scene, calibrations = require_scene(plan), NodeCalibrations.of(plan)

@@ -46,8 +46,10 @@ class ArmPair:
     def solve_joints(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """Return the commanded joint angles (6,), in rad, of both arms.
 
-        edges: poses (4, 4) of the sheet's edges. The angles are corrected by the scene's joint
-        offsets and flange compliances, as in the arm bridges.
+        The angles are corrected by the scene's joint offsets and flange compliances, as in the
+        nodes that control the arms.
+
+        edges: poses (4, 4) of the sheet's edges.
         """
         across = edges[1][:3, 3] - edges[0][:3, 3]
         length_m = float(np.linalg.norm(across))

@@ -120,10 +120,11 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """A risk that `find_loop_risk` has found in the control loop of sheet and hand.
+    """A risk in the control loop of sheet and hand, found by `find_loop_risk`.
 
     delay_s: time from the measurement of a push depth until the sheet has moved.
-    error_ratio: maximum relative error of the rendered force within the stability limits.
+    error_ratio: maximum relative error of the rendered force if the sheet moves only as far as the
+        loop is stable.
     """
 
     risk: LoopRisk
@@ -131,7 +132,7 @@ class LoopFinding:
     error_ratio: float
 
     def describe(self) -> str:
-        """Return a text that describes the risk and a remedy."""
+        """Return a text that explains what can go wrong in the control loop, and a remedy."""
         delay_ms, error_percent = 1e3 * self.delay_s, 100.0 * self.error_ratio
         match self.risk:
             case LoopRisk.OSCILLATION:
@@ -180,11 +181,13 @@ def find_loop_risk(
 
 
 def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
-    """Return the risk of the control loop of sheet and hand before a graph of nodes starts.
+    """Check the control loop of sheet and hand for risks, before a graph of nodes starts.
 
-    The parameters of the planner determine the delay. Only cached data are used, because their
-    computation can take minutes. Return None if there is no risk. Also return None if the stability
-    limits or the soft body are not cached. In this case, the planner reports the risk later.
+    The risks are that the sheet oscillates or renders a wrong force. The parameters of the planner
+    determine the delay of the control loop. Return None if no risk is found.
+
+    Only cached data are used, because their computation can take minutes. If the stability limits
+    or the soft body are not cached, return None. In this case, the planner reports the risk later.
     """
     scene = plan.scene_message()
     planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")

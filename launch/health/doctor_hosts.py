@@ -176,7 +176,10 @@ Each key is the node parameter that enables the self-check.
 def check_apparatus(
     probe: HostProbe, nodes: Sequence[ResolvedNode], scene: Scene | None = None
 ) -> Iterator[HostFinding]:
-    """Yield the calibration errors that self-checks of nodes suspect, and the disabled self-checks.
+    """Yield the results of the nodes' self-checks, which detect errors of the calibration.
+
+    Each suspected error is a finding. If no error is suspected, the finding lists the self-checks
+    that are disabled.
 
     nodes: nodes of the host in the launch file.
     """

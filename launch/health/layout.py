@@ -147,11 +147,12 @@ class Layout:
         return bool(self.reached.all()) and not self.blocked_paths
 
     def speed_m_per_s(self, fraction: float) -> float:
-        """Return the finger speed (m/s) that both arms can follow at a given fraction of samples.
+        """Return the finger speed (m/s) that both arms can follow in a fraction of the samples.
 
-        Only reachable samples are considered. Return 0 if no sample is reachable.
+        A sample is a sheet pose with a stretch and a push depth. Samples that an arm cannot reach
+        are ignored. Return 0 if no sample is reachable.
 
-        fraction: fraction from 0 to 1.
+        fraction: required fraction of the reachable samples, from 0 to 1.
         """
         if not self.reached.any():
             return 0.0
@@ -175,10 +176,12 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
     """Sample contact points on the object, with sheet poses at each point.
 
     The contact points are sampled from all directions within the scene's tilt range. In the first
-    pose at each contact point, the object touches the centre of the sheet. In the other poses, the
-    sheet has rolled to this contact point from another contact, so the object touches another point
-    of the sheet. For each axis of the sheet, the two rolls are used that end farthest from the
-    sheet's centre. Contacts outside the sheet's usable area are moved to the border of this area.
+    pose at each contact point, the object touches the centre of the sheet.
+
+    In the other poses, the object touches another point of the sheet, because the sheet has rolled
+    without slip from another contact point. Of these poses, only those with the extreme contact
+    positions along the two axes of the sheet are used. A contact position outside the sheet's
+    usable area is moved to the border of the area.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)
@@ -265,8 +268,8 @@ def _list_contacts(
 def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
     """Combine each contact with each push depth, and with the minimum and the maximum stretch.
 
-    A push moves the sheet along its normal. The arms must also follow a push at the scene's working
-    speed.
+    Each sample contains the sheet velocities that the arms must follow. These are the velocities of
+    strokes over the object, and of a push along the sheet's normal at the scene's working speed.
     """
     sheet = scene.sheet
     longest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
@@ -514,11 +517,12 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the fraction of samples that violate a given limit more than all other limits.
+    """Return how often samples violate a certain limit of an arm, and at which tilt this begins.
 
-    The result also describes the sample that has the smallest tilt among these samples.
+    A sample is counted if it violates this limit more than all other limits. The result contains
+    the fraction of counted samples, and describes the counted sample with the smallest tilt.
 
-    number: index of the given limit.
+    number: index of the limit.
     binding: for each of n samples, index (n,) of the limit that is violated most; -1 for reachable
         samples.
     """
@@ -613,9 +617,9 @@ def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class _TiltDepthGrid:
-    """A grid over the tilt and push depth of samples.
+    """A grid over the tilt and push depth of the n sampled contacts of a layout.
 
-    rows, columns: row and column (n,) of the grid cell that contains each of n samples.
+    rows, columns: row and column (n,) of the grid cell that contains each sample.
     frame: options for drawing the grid with Matplotlib's `imshow`.
     """
 

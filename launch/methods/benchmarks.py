@@ -1,6 +1,6 @@
 """Define the method families whose errors are measured against the simulator.
 
-They are defined in the package `launch`, because only this package is allowed to import both the
+This module is in the package `launch`, because only this package is allowed to import both the
 methods and the simulator.
 """
 

@@ -28,10 +28,13 @@ def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[s
 
 
 def bootstrap_median(values: Floats) -> Interval | None:
-    """Return the median of n values, one per block, with the confidence interval of the median.
+    """Return the median of n measured values, with its bootstrap confidence interval.
 
-    The value of a failed run is NaN. Returns None if no value is finite. If only one value is
-    finite, the limits of the interval are infinite.
+    values: values (n,) of independent runs, one from each block of the measurement. NaN means that
+        a run failed.
+
+    Returns None if no value is finite. If only one value is finite, the limits of the interval are
+    infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:
@@ -62,10 +65,10 @@ def compare_paired(values: Floats, control: Floats) -> Interval | None:
 
 
 def attribute_error(parts: Floats) -> Floats:
-    """Return the fractions (k,) of a mean square error that k error components cause.
+    """Return how much each of k error components contributes to the mean square error.
 
-    The fractions add up to one. A component that compensates other components has a negative
-    fraction.
+    The contributions (k,) are fractions that add up to one. A contribution is negative if the
+    component partly cancels other components.
 
     parts: error components (k, n, d), each with n vectors of d dimensions. Their sum is the total
         error.

@@ -88,10 +88,11 @@ def measure_family(
     progress: Callable[[str], None] = lambda text: None,
     select: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure all selected trials of a method family, and report the progress.
+    """Measure the methods of a method family in a scene, and report the progress.
 
-    A trial is a combination of a method and a case. Each trial is requested and measured before the
-    next one is requested, so that the family can release its data.
+    A method family contains interchangeable methods for one task. A trial measures one method in
+    one case. The family generates the next trial only after a trial is finished, so that data of
+    finished trials can be released.
 
     select: function that returns whether to measure a given trial.
     """
@@ -125,7 +126,10 @@ def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[in
 
 
 def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
-    """Return the result of a measured method family in the format of `flexsheet chart --json`."""
+    """Return the measurements of a method family in the format of `flexsheet chart --json`.
+
+    A method family contains interchangeable methods for one task.
+    """
     return {
         "family": family.name,
         "unit": family.unit,
@@ -382,9 +386,10 @@ def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
 
 
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the largest times and errors of each method, and the number of cases in its range.
+    """Return one row per method, with the largest time and error over the measured cases.
 
-    The times are medians and 99 % quantiles. Errors in cases outside the method's range are listed
+    The time of a case is given as median and 99 % quantile. Each row also contains the number of
+    cases inside the range in which the method is valid. Errors outside this range are listed
     separately.
     """
     rows = []

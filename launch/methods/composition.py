@@ -1,11 +1,13 @@
 """Find the cheapest combination of one method per method family that meets all tolerances.
 
-The error of each system metric is predicted from the measured errors of the processing stages.
-Independent random errors (spreads) add as squares. These are the marker noise, the tracking error
-at the time of use, and errors that no measurement of a method contains (planner, servo,
-calibration). Signed errors of force models and delays (biases) add linearly. The prediction decides
-which combination is run next in the graph. The measured errors of this run decide whether the
-combination is accepted.
+The error of each system metric is predicted from the measured errors of the methods. Independent
+random errors (spreads) are combined as the root of the sum of their squares. These are the marker
+noise and the tracking error at the time of use. Errors that are not measured for single methods
+(planner, servo, calibration) are added in the same way. Signed errors of force models and delays
+(biases) add linearly.
+
+The prediction decides which combination is run next in the graph. The measured errors of this run
+decide whether the combination is accepted.
 """
 
 from __future__ import annotations
@@ -34,9 +36,9 @@ P95_OVER_RMS = 1.614
 
 
 class SystemMetric(StrEnum):
-    """The 95 % errors and latencies of the system for which a tolerance exists.
+    """The errors and latencies of the system that are compared with tolerances.
 
-    The values of the enumeration are keys of the results.
+    Each metric is a 95 % quantile. The values of the enumeration are keys of the results.
     """
 
     SHEET = "sheet_mm"
@@ -61,10 +63,10 @@ class StageOption:
     """A method that can be chosen for a processing stage.
 
     cores: processor time (s) per second.
-    spreads, biases: random errors (spreads) and signed errors (biases) that the method adds to
-        system metrics. The errors are 95 % values; delays are in ms.
-    given: methods of other stages that were used when these values were measured.
-    outside: fraction of the scene's cases that are outside the method's stated range.
+    spreads, biases: random errors (spreads) and signed errors (biases) that the method adds to each
+        system metric. Random errors are 95 % quantiles. Delays are biases in ms.
+    given: methods of other stages with which these errors were measured, by stage.
+    outside: fraction of the scene's cases that are outside the range in which the method is valid.
     """
 
     method: str
@@ -85,17 +87,21 @@ Figures = Mapping[SystemMetric, float]
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """The difference by which measured system metrics exceed the predicted metrics.
+    """The errors and latencies that are not explained by the measurements of single methods.
 
-    The difference is learned from runs of the graph, and is added to later predictions.
+    For each system metric, this is the difference by which the measured value exceeds the predicted
+    value. The difference is learned from runs of the graph, and is added to later predictions.
     """
 
     parts: Figures = field(default_factory=dict)
 
     def learn(self, combination: Combination, measured: Figures) -> Unexplained:
-        """Return this difference, updated with the measured metrics of a combination.
+        """Return the unexplained errors after an update with the measured metrics of a run.
 
-        With the updated difference, `predict` no longer underestimates the measured metrics.
+        With the result, `predict` does not underestimate the measured metrics of the combination.
+
+        combination: combination of methods that was run.
+        measured: system metrics of the run.
         """
         parts = dict(self.parts)
         squares, sums = _add_up(combination)
@@ -110,7 +116,8 @@ class Unexplained:
 def predict(combination: Combination, unexplained: Unexplained | None = None) -> Figures:
     """Predict the system metrics of a combination of methods.
 
-    Random errors (spreads) add as squares. Signed errors (biases) add linearly.
+    Random errors (spreads) are combined as the root of the sum of their squares. Signed errors
+    (biases) add linearly.
     """
     squares, sums = _add_up(combination)
     for metric, value in (unexplained or Unexplained()).parts.items():
@@ -125,7 +132,10 @@ def predict(combination: Combination, unexplained: Unexplained | None = None) ->
 def _add_up(
     combination: Combination,
 ) -> tuple[dict[SystemMetric, float], dict[SystemMetric, float]]:
-    """Return, by metric, the sum of squared random errors and the sum of absolute signed errors."""
+    """Add up the errors of all methods in a combination, for each system metric.
+
+    Return the sums of the squared random errors, and the sums of the absolute signed errors.
+    """
     squares: dict[SystemMetric, float] = {}
     sums: dict[SystemMetric, float] = {}
     for option in combination.values():
@@ -137,7 +147,10 @@ def _add_up(
 
 
 def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
-    """Return the error budget of a metric: the error contribution of each stage, if not zero."""
+    """Return how much error each processing stage adds to a system metric.
+
+    Stages that add no error are omitted.
+    """
     parts = {
         stage: option.spreads.get(metric, 0.0) + abs(option.biases.get(metric, 0.0))
         for stage, option in combination.items()
@@ -146,10 +159,10 @@ def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
 
 
 def list_combinations(stages: Mapping[str, Sequence[StageOption]]) -> list[Combination]:
-    """Return all combinations of one option per stage, sorted by their cost.
+    """Return all combinations of one method per processing stage, sorted by their cost.
 
-    A combination is omitted if one of its options was measured with a method (field `given`) that
-    the combination does not contain.
+    A combination is omitted if one of its methods was measured together with a method (field
+    `given`) that the combination does not contain.
     """
     combinations = [
         dict(zip(stages, options, strict=True)) for options in product(*stages.values())
@@ -185,8 +198,10 @@ def excess(figures: Figures, tolerances: Figures) -> dict[SystemMetric, float]:
 class GraphRun:
     """A run of one combination of methods in the graph.
 
-    predicted, measured: 95 % values by metric. If the run does not measure a metric, `measured`
-        contains the predicted value.
+    methods: names of the methods, by processing stage.
+    cores: number of processor cores that the combination is expected to use.
+    predicted, measured: predicted system metrics, and metrics measured in the run, as 95 %
+        quantiles. If a metric cannot be measured, its predicted value is used for both.
     exceeded: ratio of value to tolerance of each metric that exceeds its tolerance.
     """
 
@@ -221,9 +236,9 @@ class Composition:
 
     @property
     def unmet(self) -> str:
-        """Return sentences about metrics that exceed a tolerance, and about methods out of range.
+        """Return a text about exceeded tolerances and unsuitable methods, or "" if there are none.
 
-        The text is empty if there are no such metrics or methods.
+        A method is unsuitable if the scene is not within the range in which the method is valid.
         """
         exceeded = ", ".join(metric.label for metric in self.last.exceeded)
         stages = ", ".join(stage for stage, option in self.chosen.items() if not option.in_range)
@@ -245,9 +260,9 @@ class Composition:
         }
 
     def explain(self) -> list[str]:
-        """Return sentences about the result and its problems.
+        """Return sentences about the result of the search and its problems.
 
-        A problem is a tolerance that is not met or a method that is out of range.
+        A problem is a tolerance that is not met, or a method that is not valid for the scene.
         """
         run = self.last
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
@@ -292,15 +307,18 @@ def compose(
 ) -> Composition:
     """Find the cheapest combination of methods that meets all tolerances in a run of the graph.
 
-    Only combinations with the fewest cases outside the methods' ranges are considered. First, the
-    cheapest combination is run whose predicted metrics meet the tolerances with the margin. If this
-    combination exceeds a tolerance in the run, all predictions are corrected, and the next
-    combination is run. This ends if no other combination is predicted to be better in the exceeded
-    metrics. Finally, if the predicted errors were too large, cheaper combinations are run, unless
-    the error of one of their methods alone exceeds a tolerance.
+    A method has a range of cases in which it is valid. Only combinations with the fewest cases
+    outside these ranges are considered. The search has three steps:
 
-    If no combination can meet a tolerance, a combination is chosen that is near the smallest
-    attainable value.
+    1. The cheapest combination is run whose predicted metrics meet the tolerances with the margin.
+    2. If a tolerance is exceeded in the run, all predictions are corrected, and the next
+       combination is run. This is repeated until no other combination is predicted to improve an
+       exceeded metric.
+    3. If the predictions for the best run were too pessimistic, cheaper combinations are run.
+       Combinations in which the error of a single method exceeds a tolerance are skipped.
+
+    If no combination can meet a tolerance, the result is near the smallest attainable value of this
+    metric.
 
     run_graph: function that runs a combination and returns its metrics.
     margin: fraction of each tolerance that a predicted metric must leave unused.
@@ -356,9 +374,10 @@ def compose(
 
 
 def _find_best(runs: Sequence[GraphRun], tolerances: Figures) -> int:
-    """Return the index of the run that exceeds the attainable limits (`_relax`) least.
+    """Return the index of the run that exceeds the tolerances least.
 
-    If several runs exceed the limits equally, the index of the cheapest run is returned.
+    A tolerance that no run meets is first raised to about the smallest measured value (`_relax`).
+    If several runs are equally good, the index of the cheapest run is returned.
     """
     limits = _relax(tolerances, [run.measured for run in runs])
     return min(
@@ -373,14 +392,17 @@ def _find_cheaper(
     tolerances: Figures,
     margin: float,
 ) -> Combination | None:
-    """Return the cheapest untested combination that costs less than the best run.
+    """Return the cheapest untested combination of methods that costs less than the best tested one.
 
-    The combination must be predicted to be as good as the best run. Returns None if there is no
-    such combination.
+    Its predicted errors must meet the tolerances, or at least be as small as those of the best
+    tested combination. Returns None if there is no such combination.
 
-    The errors of a method are worst-case errors, so the sum over all methods overestimates the
-    errors of the system. The predictions are therefore multiplied by the ratio of measured to
-    predicted errors in the best run.
+    The predicted errors are sums of worst-case errors, which are larger than the errors of the
+    system. They are therefore corrected by the ratio of measured to predicted errors of the best
+    tested combination.
+
+    best: result of the best tested combination.
+    margin: fraction by which the tolerances are reduced.
     """
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     limits = _relax(allowed, [best.measured])
@@ -399,9 +421,13 @@ def _find_cheaper(
 
 
 def _adds_miss(one: Combination, best: Combination, tolerances: Figures) -> bool:
-    """Return whether a method in `one` alone exceeds a tolerance that the method in `best` meets.
+    """Return whether a single method in a combination already exceeds a tolerance.
 
-    A run of the graph does not contain all cases of the working range, so it cannot disprove this.
+    A method is accepted if the method for the same stage in the combination `best` exceeds this
+    tolerance too.
+
+    The check is based on measurements of single methods over the whole working range. A run of the
+    graph covers only a part of the range, so it cannot prove that the tolerance is met.
     """
     return any(
         _own_error(option, metric) > limit >= _own_error(best[stage], metric)
@@ -415,11 +441,14 @@ def _own_error(option: StageOption, metric: SystemMetric) -> float:
 
 
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
-    """Return the cheapest combination that is predicted to be within the attainable limits.
+    """Return the cheapest combination of methods that is predicted to meet all limits.
 
-    If no combination is within all limits, return the combination with the smallest excess.
+    A limit that no combination meets is first raised to about the smallest predicted value
+    (`_relax`). If no combination meets all limits at the same time, return the combination that
+    exceeds them least.
 
-    limits: wanted limits, before they are raised to attainable values.
+    left: combinations that have not been run.
+    limits: maximum of each system metric.
     """
     predicted = [predict(one, unexplained) for one in left]
     attainable = _relax(limits, predicted)
@@ -431,15 +460,19 @@ def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figu
 
 
 def _outside(combination: Combination) -> float:
-    """Return the sum, over all methods, of the fraction of cases outside the method's range."""
+    """Return in how many cases the methods of a combination are not valid.
+
+    For each method, this is the fraction of the scene's cases outside the range in which the method
+    is valid. The result is the sum of these fractions.
+    """
     return sum(option.outside for option in combination.values())
 
 
 def _relax(limits: Figures, found: Sequence[Figures]) -> Figures:
-    """Return the limits after raising each limit that is below the attainable value.
+    """Raise each limit that no combination of methods meets to an attainable value.
 
-    The attainable value is the smallest value of the metric in `found`, multiplied by the ratio up
-    to which two values are considered equal.
+    The attainable value is the smallest value of the metric in `found`, multiplied by a tolerance
+    factor for values that are considered equal.
 
     found: metrics of each combination.
     """

@@ -72,7 +72,10 @@ FINEST = NODE_DEFAULTS.model_copy(
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """A choice of methods for all nodes, with further parameters of the planner by name."""
+    """A choice of methods for all nodes, with values of further planner parameters.
+
+    planner: values of the planner parameters, by parameter name.
+    """
 
     name: str
     methods: Methods
@@ -117,10 +120,10 @@ class Configuration:
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return the cheapest method of each family whose range contains the scene's working range.
+    """Return the cheapest method of each family that is valid in the scene's whole working range.
 
-    Errors are not considered. If no method of a method family has a sufficient range, the method
-    with the largest range is returned.
+    Errors are not considered. If no method of a method family is valid in the whole range, the
+    method with the largest valid range is returned.
     """
     depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
     stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)
@@ -181,7 +184,7 @@ def list_configurations(scene: Scene) -> list[Configuration]:
 
 
 def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
-    """Return the configurations with the given names, and the control configuration.
+    """Return the configurations with the given names, and the one with which they are compared.
 
     If no name is given, all configurations are returned. Raises ExperimentError if a name is
     unknown.

@@ -2,8 +2,8 @@
 
 Processor use and latency are measured in the running graph (`experiments/system_run.py`). The
 measurement is repeated in blocks, each with a run of every configuration. Results are medians over
-blocks, with the confidence intervals of these medians. Errors are 95 % values that are computed in
-simulated time (`experiments/system_errors.py`). The nominal apparatus (set of true hardware
+blocks, with the confidence intervals of these medians. Errors are 95 % quantiles that are computed
+in simulated time (`experiments/system_errors.py`). The nominal apparatus (set of true hardware
 parameters) and random apparatuses are used. Each trial is a separate process.
 """
 
@@ -65,10 +65,11 @@ COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
 
 @dataclass(frozen=True, slots=True)
 class SceneTrials:
-    """The trials of one scene.
+    """The planned trials that measure the whole system in one scene.
 
     trials: description of each trial, by trial name.
-    places: block and configuration of each trial, by trial name.
+    places: repetition number (block) and configuration of each trial that runs the graph, by trial
+        name.
     common: settings that all trials share.
     """
 
@@ -83,7 +84,7 @@ class SceneTrials:
 def describe_errors(
     launch: Path, configurations: Sequence[Configuration], apparatus: str | None, seconds: float
 ) -> dict[str, Any]:
-    """Return the specification of a trial that computes display errors of several configurations.
+    """Return the JSON description of a trial that computes the display errors of configurations.
 
     All configurations use the same true parameters of the simulated hardware (the apparatus).
 
@@ -110,11 +111,12 @@ def plan_trials(
     apparatuses: int,
     configurations: Sequence[str] = (),
 ) -> SceneTrials:
-    """Return the trials of one scene.
+    """Plan the trials that measure the whole system in one scene.
 
-    The first trials compute errors. The blocks follow, each with all configurations in random
-    order.
+    The first trials compute the display errors. The other trials run the graph, and are repeated in
+    blocks. Each block contains all configurations in random order.
 
+    blocks: number of blocks.
     seconds: duration of each stroke of the finger.
     apparatuses: number of random apparatuses (sets of true hardware parameters).
     """
@@ -138,9 +140,11 @@ def plan_configurations(
     seconds: float,
     apparatuses: int = 0,
 ) -> SceneTrials:
-    """Return the trials of the chosen configurations.
+    """Plan the trials that measure certain configurations of the system in one scene.
 
-    The control configuration runs twice in each block.
+    The runs of the graph are repeated in blocks, and each block contains all configurations. One
+    configuration, the control, runs twice in each block. The difference between its two runs shows
+    the measurement noise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     launch = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml").resolve()
@@ -173,7 +177,10 @@ def plan_configurations(
 
 
 def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
-    """Return launch settings that give the finger the same random motion in all runs of a block."""
+    """Return launch settings that give the finger the same random motion in all runs of a block.
+
+    A block is one run of each configuration that is compared.
+    """
     seed = FINGER_SEED + block
     return [f"{node.name}.seed={seed}" for node in graph.nodes_of_type("twin_finger")]
 
@@ -306,8 +313,9 @@ def summarize_configuration(
 ) -> dict[str, Any]:
     """Summarize one configuration as one point of the chart.
 
-    Ratios to the control configuration are computed from all blocks in which both configurations
-    have a row.
+    The measurements are repeated in blocks, each with a run of every configuration. Each run is
+    compared with the run of the control configuration in the same block. Blocks in which one of
+    these runs failed are omitted from this comparison.
 
     rows: processor use and latencies by configuration and block.
     errors: errors with hardware that does not deviate from the scene.
@@ -415,8 +423,8 @@ def worst_ratio(point: Mapping[str, Any]) -> Interval:
 def find_system_front(points: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the names of a scene's configurations that are on the Pareto front.
 
-    The compared costs are the latency from exposure to arm, the processor cores, and the worst
-    error relative to its tolerance.
+    The compared costs are the latency from the camera's exposure to the arm's motion, the number of
+    used processor cores, and the largest error-to-tolerance ratio.
     """
     costs = {}
     for point in points:

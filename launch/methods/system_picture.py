@@ -58,9 +58,13 @@ def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
 def _draw_front(
     axes: Axes, scene: str, points: Sequence[Mapping[str, Any]], front: set[str]
 ) -> None:
-    """Draw the worst ratio of error to tolerance against the latency from exposure to arm command.
+    """Draw a point for each configuration of the system: its worst error against its latency.
 
-    front: names of the points on the Pareto front.
+    The error is divided by its tolerance. The latency is the time from a camera exposure to the arm
+    command.
+
+    points: results of each configuration.
+    front: names of the configurations on the Pareto front.
     """
     corners = []
     for colour, point in zip(COLOURS, points, strict=False):
@@ -108,9 +112,10 @@ def _draw_front(
 
 
 def _allowed_ms(points: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the scene's maximum latency (ms) from exposure to arm command.
+    """Return the tolerance (ms) of the latency from a camera exposure to the arm command.
 
-    Return None if no point states this latency.
+    The tolerance is computed from the results of the first configuration with a measured latency.
+    Return None if there is no such configuration.
     """
     key = "exposure_to_arm_ms.p95"
     for point in points:

@@ -1,7 +1,7 @@
 """Choose the fastest sufficient method of each method family, and write the choices to the scene.
 
 A method family contains interchangeable methods for one task. The methods are measured on this
-computer over the scene's working range. A method is sufficient if its stated range contains the
+computer over the scene's working range. A method is sufficient if it is valid over the whole
 working range. Its maximum error must also be at most the scene's tolerance minus a margin. If no
 method is sufficient, the best insufficient method is chosen and reported.
 """
@@ -59,14 +59,14 @@ class UnknownTunableError(FlexsheetError, KeyError):
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """A method family from which a scene can choose one method.
+    """A set of interchangeable methods for one task, of which one is chosen for a scene.
 
-    families: locations `module:NAME` of the `Family` objects that form the method family, in the
-        order of measurement. The methods of a later object take minutes to prepare. They are
-        measured only if no earlier method is sufficient.
+    families: import locations `module:NAME` of the `Family` objects with the methods, in the order
+        of measurement. The methods of later objects take minutes to prepare, so they are measured
+        only if no earlier method is sufficient.
     settings: values that can be written into the scene, by the method's name in the chart.
     required_key: dotted key of the scene. If the scene does not have this key, no node uses the
-        method family. None if no key is required.
+        methods. None if no key is required.
     """
 
     name: str
@@ -85,7 +85,10 @@ class Tunable:
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
-    """Return the scene settings of all methods that the `Literal` type `methods` names."""
+    """Return the scene setting of each method, by method name. The setting is the method's name.
+
+    methods: `Literal` type that contains the method names.
+    """
     return {name: name for name in get_args(methods)}
 
 
@@ -169,10 +172,12 @@ class MethodEvaluation:
     """The evaluation of one method over a scene's working range.
 
     median_s, slowest_s: median and maximum of the time per call over the cases.
-    error: maximum error within the method's stated range; infinite if no reference is known.
+    error: maximum error over the cases in which the method is valid; infinite if no reference is
+        known.
     worst_case: case in which this error occurs.
-    outside: cases outside the method's stated range.
-    wrong: cases that have no reference, or whose error exceeds the tolerance minus the margin.
+    outside: cases outside the range in which the method is valid.
+    wrong: other cases with an unknown error, or with an error above the tolerance minus a safety
+        margin.
     points: measurements of all cases.
     """
 
@@ -336,7 +341,7 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
     """Return the fastest method that meets the tolerance over the working range.
 
     If several methods are equally fast, the most accurate method is returned. If no method is
-    sufficient, the method with the fewest cases outside its range is returned.
+    sufficient, the method that is valid in the most cases is returned.
     """
     sufficient = [one for one in evaluations if one.meets]
     if not sufficient:
@@ -347,7 +352,11 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
 
 
 def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
-    """Return a sort key that puts methods with fewer cases outside their range first."""
+    """Return a sort key that orders insufficient methods from the best to the worst.
+
+    The first criterion is the number of cases outside the range in which the method is valid.
+    Further criteria are the number of all failed cases, the error, and the time.
+    """
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -358,11 +367,13 @@ def tune(
     margin: float = MARGIN,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Choice]:
-    """Measure the methods of each family in `tunables` in order, and choose one method per family.
+    """Measure interchangeable methods, and choose one method of each method family in `tunables`.
 
-    Raises the exception of a method family that does not support the scene's shape, mesh or sheet.
+    If a method family does not support the scene's shape, mesh or sheet, an exception of this
+    family is raised.
 
-    margin: fraction of each tolerance that is reserved.
+    margin: fraction of each tolerance that remains unused, as a reserve for cases that are not
+        measured.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
@@ -383,7 +394,7 @@ def tune(
 
 
 def find_choice(choices: Sequence[Choice], family: str) -> Choice | None:
-    """Return the choice for a method family, or None if the family was not tuned."""
+    """Return the tuning result of a method family, or None if the family was not tuned."""
     return next((one for one in choices if one.family == family), None)
 
 
@@ -452,13 +463,15 @@ def insert_choices(
     commit: str | None,
     unmet: str = "",
 ) -> str:
-    """Return the text of a scene file with the choices inserted in its mapping `methods`.
+    """Return the text of a scene file with the chosen methods inserted in its mapping `methods`.
 
-    All other text is unchanged, including the methods of other method families. If `methods` is a
-    mapping on one line, it is expanded to several lines.
+    All other text is unchanged, including methods for which no choice is given. If `methods` is a
+    mapping on one line, it is expanded to several lines. A comment before the mapping states the
+    origin of the choices.
 
-    today, machine, commit: date, computer and git commit for the generated comment.
-    unmet: sentences for the comment about tolerances that are not met.
+    choices: chosen methods.
+    today, machine, commit: date, computer and git commit for the comment.
+    unmet: sentences for the comment that describe exceeded tolerances, or an empty text.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
@@ -562,7 +575,11 @@ FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
 
 
 def relocate_paths(text: str, source: Path, target: Path) -> str:
-    """Return the text of a scene file with relative paths that are valid in the target's folder.
+    """Return the text of a scene file with its relative paths changed for use in another folder.
+
+    source: scene file that contains the text.
+    target: file to which the text will be written. The relative paths in the result are valid in
+        its folder.
 
     Raises BadInputError if a path in the text cannot be replaced.
     """
@@ -661,9 +678,9 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice], unmet: 
 
 
 def _load_draft(draft: Path, source: Path) -> Scene:
-    """Load a temporary copy of a scene file that contains the choices.
+    """Load a temporary copy of a scene file, into which the chosen methods have been inserted.
 
-    Error texts name the source file, because the user does not know the copy.
+    Error texts name the user's scene file `source` instead of the temporary copy.
     """
     try:
         return load_scene(draft)

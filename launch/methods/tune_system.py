@@ -77,12 +77,15 @@ def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
 
 
 def make_stages(scene: Scene, choices: Sequence[Choice]) -> dict[str, list[StageOption]]:
-    """Return the methods of each tuned method family, with the errors that they add to the system.
+    """Return, for each processing stage, the methods with the errors that they add to the system.
 
-    The tracking methods are measured with the noise of each marker method. The tracking error at
-    the time of exposure adds to the fingertip's error. The tracking error at the longest prediction
-    horizon adds to the sheet's error. The two-pass image correction can be used only with the
-    chosen sheet shape, because it was measured only with this shape.
+    A stage is a task, such as tracking, with several measured methods. The tracking methods are
+    measured with the noise of each marker method. The tracking error at the time of exposure adds
+    to the fingertip's error. The tracking error at the longest prediction horizon adds to the
+    sheet's error.
+
+    The two-pass image correction can be used only with the chosen sheet shape, because it was
+    measured only with this shape.
     """
     stages: dict[str, list[StageOption]] = {}
     for choice in choices:
@@ -134,9 +137,12 @@ def _make_option(
 
 
 def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
-    """Return the largest finite absolute value over the measured points within the method's range.
+    """Return the largest absolute value of a quantity over the measurements of a method.
 
-    The result is 0 if there is no finite value.
+    Measurements outside the range in which the method is valid are ignored, as are NaN and infinite
+    values. The result is 0 if no value remains.
+
+    value: function that returns the quantity of a measurement.
     """
     found = [abs(value(point)) for point in points if point.in_range]
     return max((one for one in found if math.isfinite(one)), default=0.0)
@@ -175,17 +181,17 @@ def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]
 
 
 def _outside(one: MethodEvaluation) -> float:
-    """Return the fraction of cases that are outside the method's range.
+    """Return the fraction of the measured cases in which a method is not valid.
 
-    Return 1 if the error of the method is unknown.
+    If the error of the method is unknown, the result is 1.
     """
     return len(one.outside) / one.cases if math.isfinite(one.error) else 1.0
 
 
 def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> list[Choice]:
-    """Return the choices after replacing the chosen method of each method family.
+    """Replace the chosen method in the tuning result of each method family.
 
-    methods: new methods by method family.
+    methods: name of the new method, by method family.
     """
     return [
         replace(
@@ -216,11 +222,12 @@ def tune_system(
     margin: float,
     runs: int,
 ) -> tuple[Composition, list[Choice]]:
-    """Find the cheapest combination of measured methods that meets the tolerances of the system.
+    """Find the cheapest combination of methods with which the whole system meets its tolerances.
 
-    Return the result of the search, and the choices for the scene.
+    Return the result of the search, and the tuning results with the methods of this combination.
 
-    runs: number of runs per combination. The largest 95 % value of these runs is used.
+    choices: tuning result of each method family, with its measured methods.
+    runs: number of runs per combination. The largest 95 % quantile of these runs is used.
 
     Raises ExperimentError if a run of a combination fails.
     """
@@ -246,10 +253,10 @@ def run_proposal(
     *,
     runs: int,
 ) -> Figures:
-    """Run a configuration, and return its system metrics.
+    """Measure the errors and latencies of the system with one configuration of methods.
 
-    Errors are 95 % values that are computed in simulated time. A latency is the largest 95 % value
-    of `runs` runs of the graph.
+    The errors are 95 % quantiles over a finger stroke in simulated time. For the latencies, the
+    graph is run `runs` times, and the largest 95 % quantile of these runs is returned.
     """
     planned = plan_configurations(
         scene_file, [configuration], folder, blocks=runs, seconds=STROKE_S

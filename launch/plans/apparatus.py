@@ -55,9 +55,10 @@ class Draw:
 
 
 def parse_draw(text: str) -> Draw | None:
-    """Parse the value of `--apparatus`; return None if the value is a file name.
+    """Parse the value of --apparatus, the option that selects parameters of simulated hardware.
 
-    Raises BadInputError if the value starts with "seed:" but is not a valid random sample.
+    Return None if the value is a file name. Raises BadInputError if the value starts with "seed:"
+    but has a wrong format.
     """
     if not text.startswith("seed:"):
         return None
@@ -78,8 +79,9 @@ def parse_draw(text: str) -> Draw | None:
 def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> Apparatus:
     """Read true hardware parameters from a file, or sample them from a text such as "seed:7".
 
-    scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
-        sampled relative to the scene before commissioning, in the world frame of the camera.
+    scene_file: file of the scene. If this scene is the result of a calibration (commissioning),
+        uncalibrated hardware is sampled relative to the original scene. The world frame of the
+        result is then defined by the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
@@ -104,9 +106,11 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
 
 
 def _load_base(scene_file: Path | None) -> Scene | None:
-    """Load the scene from which the commissioning of a scene file started.
+    """Load the original scene, from which a calibrated scene was made by commissioning.
 
-    Return None if the file does not result from a commissioning.
+    Return None if the scene file is not the result of a commissioning.
+
+    scene_file: file of the calibrated scene.
     """
     state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
     if state is None or not state.is_file():

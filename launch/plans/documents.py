@@ -155,7 +155,7 @@ class Document:
         return str(self.path)
 
     def folder(self, key: Key) -> Path:
-        """Return the base folder of a relative path in the value of `key`.
+        """Return the folder relative to which a path in the value of `key` is given.
 
         This is the folder of the file that contains `key`. If a command-line option overrides the
         value, the current folder is returned.
@@ -187,7 +187,7 @@ class Document:
         self.text = f"# {base.path}\n{base.text}\n# {self.path}\n{self.text}"
 
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
-        """Return a problem that is located at `key` in this document.
+        """Return the description of an error in this file, with the location of the key.
 
         what: description of the error.
         remedy: what the user should do.

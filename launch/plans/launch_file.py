@@ -174,7 +174,7 @@ def read_scene_file(path: Path) -> Document:
 
 
 def is_scene_file(path: Path) -> bool:
-    """Return whether a YAML file is a scene, and no launch file, calibration or apparatus.
+    """Return whether a YAML file is a scene, and not a launch file, calibration or apparatus.
 
     Raises BadInputError if the file cannot be read.
     """

@@ -27,7 +27,10 @@ REASON_TEXTS = {
 
 
 def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
-    """Return a copy of the scene without the given parts of the display."""
+    """Return a copy of the scene that displays no image or no force, as chosen.
+
+    features: features to remove.
+    """
     changes: dict[str, object] = {}
     if Feature.IMAGE in features:
         changes["projector"] = None

@@ -52,7 +52,7 @@ They are used for plans in older bags, which do not list calibrations.
 
 
 class ArmingMode(StrEnum):
-    """The values of the parameter `arming` of the arm bridge.
+    """The values of the parameter `arming` of the arm bridge (node that controls an arm).
 
     auto: the arm moves without a command.
     manual: the arm moves only after a command of the user.
@@ -197,7 +197,7 @@ class ResolvedProcess:
 
     @property
     def settings(self) -> ResolvedNode:
-        """Return the first node. Its process settings apply to all nodes of the process."""
+        """Return the node whose process settings apply to the whole process: the first node."""
         return self.nodes[0]
 
     @property

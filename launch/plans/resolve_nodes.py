@@ -99,7 +99,7 @@ class NodeEntry:
 def collect_entries(spec: LaunchFile, document: Document) -> list[NodeEntry]:
     """Return the nodes of a launch file, including automatically added recorder and clock nodes.
 
-    Problems are reported to `document`.
+    document: contents of the launch file. Errors in the list of nodes are stored in it.
     """
     entries = []
     for name, node_spec in spec.nodes.items():
@@ -145,7 +145,7 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
 def resolve_entry(entry: NodeEntry, document: Document) -> None:
     """Find the node's class, connect its ports, and check its parameters.
 
-    Problems are reported to `document`.
+    document: contents of the launch file. Errors are stored in it.
     """
     key = entry.key
     type_name = entry.spec.type

@@ -36,10 +36,11 @@ def list_writers(
 ) -> dict[str, list[tuple[str, str]]]:
     """Return the (writer, host) pairs of each topic, in the order of the launch file.
 
-    A topic that has more writers than allowed is reported to `document`.
+    If a topic has more writers than allowed, a problem is stored in `document`.
 
-    has_scene, has_apparatus: whether the launcher publishes a scene, and an apparatus (true
-    parameters of simulated hardware).
+    has_scene: whether the launcher publishes a scene.
+    has_apparatus: whether the launcher publishes true parameters of simulated hardware (an
+        apparatus).
     """
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
@@ -88,7 +89,7 @@ def resolve_further_inputs(
     """Add the inputs that depend on node parameters, such as the topics of a recorder.
 
     writers: (writer, host) pairs by topic.
-    document: launch file to which problems are reported.
+    document: contents of the launch file. Errors such as unknown topics are stored in it.
     """
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:

@@ -27,8 +27,9 @@ def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
 
 
 def name_shipped(given: str | Path, shipped: Path) -> str:
-    """Return the hint for a file that does not exist: a text with the names of the shipped files.
+    """Return the remedy for an error about a missing file, with the names of the shipped files.
 
+    given: path or name that the user gave.
     shipped: folder of the shipped files, which is LAUNCH_FILES or SCENES.
     """
     names = list_shipped(shipped)

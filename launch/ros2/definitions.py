@@ -97,7 +97,10 @@ def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
 
 
 def make_definitions(kinds: Iterable[type[Message]]) -> dict[str, str]:
-    """Return the .msg texts of message types and their groups of fields, by ROS type name."""
+    """Return the .msg definitions of message types, by ROS type name.
+
+    The result also contains the definitions of the groups of fields that the messages contain.
+    """
     found: dict[str, str] = {}
     waiting: list[type[BaseModel]] = list(kinds)
     while waiting:

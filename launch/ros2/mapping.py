@@ -148,9 +148,12 @@ class Source:
     flanges: dict[Side, Floats]
 
     def stamped(self, kind: str, name: str, value: Any, frame: str = WORLD) -> Any:
-        """Make a ROS message of the type `kind` with a header.
+        """Make a ROS message that consists of a header and one other field.
 
-        value: value of the field `name`.
+        The header contains the source timestamp of the flexsheet message.
+
+        kind: ROS type of the message.
+        name, value: name and value of the other field.
         """
         header = self.ros.header(self.at_ns, frame)
         return self.ros.make(kind, **{"header": header, name: value})
@@ -528,9 +531,10 @@ VIEWS = (
 
 @cache
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
-    """Return the ROS topics for a flexsheet topic, each with the view that makes its messages.
+    """Return the ROS topics to which the messages of a flexsheet topic are converted.
 
-    Topics with standard types come first. The last topic contains all fields and has no view.
+    The first topics have standard ROS types. Each is returned with the `View` that defines its
+    conversion. The last topic has a generated type with all fields, and None instead of a view.
     """
     found: list[tuple[RosTopic, View | None]] = [
         (RosTopic("/" + view.name.format(topic=topic.name), view.ros_type, view.latched), view)

@@ -38,11 +38,11 @@ _PR_SET_PDEATHSIG = 1
 
 
 def exit_with_parent() -> None:
-    """End this process when its launcher exits.
+    """Make this process end when its launcher exits.
 
-    When the launcher exits, the kernel sends SIGTERM, even if the event loop of the process hangs.
-    If the process has not ended after `GRACE_S`, a thread that reads the lifeline kills the process
-    and its children.
+    The kernel then sends SIGTERM, even if the event loop of the process hangs. A thread also waits
+    for the end of a pipe (lifeline) that the launcher holds open. If the process has not ended
+    `GRACE_S` after the pipe has closed, the thread kills the process and its children.
     """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:

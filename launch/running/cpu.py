@@ -42,9 +42,10 @@ class Waits:
 
 
 class CpuWatch:
-    """A monitor of the times that processes wait for cores and use cores, over the last WINDOW_S.
+    """A monitor that measures how long processes wait for a processor core.
 
-    Call `update` once a second.
+    Waiting times are measured over the last WINDOW_S seconds. The monitor also finds the programs
+    that use the cores. Call `update` once a second.
 
     proc: folder of the kernel's counters.
     now_s: function that returns the time (s) of the monotonic clock.
@@ -65,13 +66,13 @@ class CpuWatch:
         """Return the name and waiting time of the node that waited longest for the processor.
 
         The waiting time is measured over the last WINDOW_S seconds. Returns None if no waiting time
-        is known.
+        is known. If the computer is overloaded, the programs that use the most processor time are
+        included.
 
-        watched: process ids of the measured nodes by node name.
-        named: process ids by node name. Programs with these ids are reported by node name. If it is
-            None, `watched` is used.
-        measure_programs: whether to list the running programs even if the computer is not
-            overloaded.
+        watched: process ids of the measured nodes, by node name.
+        named: process ids of all nodes, by node name. In the list of programs, these processes have
+            the names of their nodes. If it is None, `watched` is used.
+        measure_programs: whether to list the programs even if the computer is not overloaded.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -110,7 +111,8 @@ class CpuWatch:
 
         The result is empty if the last call was more than WINDOW_S seconds ago.
 
-        named: process ids by node name.
+        named: process ids of nodes, by node name. The result contains the node names instead of the
+            names of their programs.
         """
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}

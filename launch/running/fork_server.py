@@ -79,7 +79,7 @@ class ForkServer:
     node_types: types of the nodes. If a type is defined outside this package, its module is not
         imported, because the module could start threads.
     config_files: configuration files of all processes that can be started.
-    lifeline: file descriptor that the nodes inherit.
+    lifeline: file descriptor of a pipe that the nodes inherit. When the pipe closes, the nodes end.
     log: file for the server's own output.
     """
 
@@ -278,10 +278,12 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
 
 
 def _write_arguments(arguments: list[str]) -> None:
-    """Replace the arguments of this process in /proc, because tools identify nodes by them.
+    """Replace the command-line arguments of this process in /proc, by which tools identify nodes.
 
-    The remaining space is filled with an argument of spaces, which precedes the last two arguments.
-    Raises ValueError if the space is too small.
+    The new arguments must have the same total length as the old arguments. An argument that
+    consists of spaces is therefore inserted before the last two arguments.
+
+    Raises ValueError if the new arguments are too long.
     """
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     start, end = int(fields[_ARGUMENTS_START]), int(fields[_ARGUMENTS_END])

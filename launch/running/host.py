@@ -296,9 +296,10 @@ class HostAgent:
             await asyncio.sleep(PERIOD_S)
 
     def _report_busy(self, status: HostStatus) -> None:
-        """Log that the processor became overloaded, at most once per BUSY_REPORT_PERIOD_S.
+        """Log that the processor is overloaded, at most once per BUSY_REPORT_PERIOD_S.
 
-        The second status in sequence is logged, because the first does not list the programs.
+        The log entry is made from the second consecutive status with an overload. The first such
+        status does not yet list the programs that use the processor.
         """
         now_ns = self._clock.now_ns()
         self._busy_statuses = self._busy_statuses + 1 if is_busy(status) else 0
@@ -311,9 +312,9 @@ class HostAgent:
             self._on_problem(f"{describe_busy(status)}; {remedy}")
 
     def _limit_real_time(self) -> None:
-        """Withdraw the real-time priorities of this graph if another node gets no processor.
+        """Withdraw the real-time priorities of this graph's nodes if they starve another node.
 
-        All ready nodes are checked, including nodes of high niceness, which are expected to wait.
+        All running nodes are checked, including those of low priority (high niceness).
         """
         pids = self._pids()
         ready = {one.name for one in self._processes() if one.state == "ready"}
@@ -383,14 +384,15 @@ def make_output(
 
 
 def has_estop(state: ArmState) -> bool:
-    """Return whether the bridge of an arm has engaged an e-stop."""
+    """Return whether the node that controls an arm has engaged an e-stop."""
     return state.mode == "estop" or state.estop_engaged
 
 
 def list_arms(plan: ResolvedGraph) -> list[str]:
     """Return the network addresses of the arms.
 
-    If an arm has no address, it is represented by the text "host/node" of its bridge.
+    If an arm has no address, the text "HOST/NODE" is returned for it. It names the node that
+    controls the arm.
     """
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]

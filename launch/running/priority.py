@@ -31,10 +31,10 @@ def _has_cap_sys_nice() -> bool:
 
 
 def min_node_nice() -> int:
-    """Return the minimum configured niceness that is permitted for a node.
+    """Return the minimum niceness that a launch file may set for a node on this computer.
 
-    This is the most negative change of niceness that the user is permitted to make. If the niceness
-    of this process is lower, it is returned instead.
+    The minimum depends on the permissions of the user. Values down to the niceness of this process
+    are always permitted.
     """
     return min(min_nice_step(), os.getpriority(os.PRIO_PROCESS, 0))
 

@@ -67,7 +67,7 @@ class Run:
 
     @property
     def host(self) -> str | None:
-        """Return the host whose nodes the run started, or None if it started all hosts' nodes."""
+        """Return the host whose nodes the launcher started; None for the nodes of all hosts."""
         try:
             return (self.directory / HOST_FILE).read_text()
         except FileNotFoundError:
@@ -105,7 +105,10 @@ def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Replace the placeholder of the run's directory in the endpoints of sources by its path."""
+    """Insert the path of the run's directory into the endpoints of sources.
+
+    The path replaces the placeholder RUN_DIRECTORY.
+    """
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(

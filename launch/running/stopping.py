@@ -118,10 +118,12 @@ If `send_early` was called, this list contains one list of attempts. Otherwise, 
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
-    """Engage the e-stop in the runs with these directories, and return all attempts.
+    """Engage the e-stop in several runs of graphs, and return the outcome of each attempt.
 
     The steps are listed at the beginning of this module. The function waits at most KILL_AFTER_S
     for answers before it kills processes.
+
+    runs: directories of the runs.
     """
     started_s = time.monotonic()
     attempts: list[StopAttempt] = []
@@ -182,9 +184,10 @@ def _send_request(file: Path, request: bytes) -> socket.socket | None:
 
 
 def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Wait for confirmations until `until_s`.
+    """Wait until `until_s` for confirmations of an emergency stop.
 
-    Receivers that confirm are removed from `waiting` and returned.
+    The receivers are launchers and nodes that control an arm. The receivers that confirm the stop
+    are removed from `waiting` and returned.
 
     until_s: time of the monotonic clock, s.
     """

@@ -190,11 +190,12 @@ class Child:
     async def wait_until_silent(self, seconds: float, on_starved: Callable[[float], None]) -> None:
         """Wait until the process has sent no heartbeat for `seconds`.
 
-        The duration of the silence is the number of the launcher's polls multiplied by their
-        period. Clock time is not used, because a launcher that was suspended received no heartbeats
-        either. Waiting time for a processor core does not count. If the timeout is prevented only
-        because this waiting time is subtracted, `on_starved` is called once with the subtracted
-        time (s).
+        The launcher checks for heartbeats periodically, and adds up the periods without a
+        heartbeat. It does not compare clock times, because a suspended launcher receives no
+        heartbeats either.
+
+        The time in which the process waits for a processor core is not counted. If the silence
+        would otherwise exceed `seconds`, `on_starved` is called once with this waiting time (s).
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)
@@ -322,8 +323,8 @@ class RunningGraph:
     without: names of nodes that are not started.
     report: function that is called with (node, line) for every log line. The folder `run.logs` also
         contains all lines.
-    port_options: for parameters "node.name" that are ports, the options of the command that set
-        them. Other ports are set by --set.
+    port_options: command-line options that set TCP ports, by parameter "node.name". Errors about
+        occupied ports recommend these options. For other parameters, they recommend --set.
     """
 
     def __init__(
@@ -832,9 +833,10 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the graph's scene file as JSON files into `folder`.
+        """Write the scenes that can be selected at run time as JSON files into a folder.
 
-        Nodes that publish scenes read these files.
+        These are all scenes in the same folder as the scene file of the graph. Nodes that publish
+        scenes read the JSON files.
         """
         folder.mkdir()
         own = self.plan.scene_file
@@ -981,7 +983,15 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
 
 
 def _name_port_options(plan: ResolvedGraph, port: int, options: Mapping[str, str]) -> str:
-    """Return the options that change a port at the nodes that listen and connect, or ""."""
+    """Return the command-line options by which the user can change an occupied TCP port.
+
+    The options, which are a part of an error text, cover all nodes that listen on the port or
+    connect to it. The result is empty if no parameter contains the port.
+
+    port: number of the port.
+    options: option for each parameter "node.name" that has a special option. For other parameters,
+        the option is --set.
+    """
     names = [
         options.get(f"{node.name}.{name}", f"--set {node.name}.{name}=PORT")
         for node in plan.nodes.values()
@@ -1005,7 +1015,10 @@ def _list_ports(plan: ResolvedGraph, host: str | None) -> list[tuple[str, str, i
 
 
 def _find_port_users() -> dict[tuple[str, int], Run]:
-    """Return the running graph of this user that uses each address and TCP port."""
+    """Return a mapping from (address, TCP port) to the running graph that uses the port.
+
+    Only graphs of this user are found.
+    """
     users: dict[tuple[str, int], Run] = {}
     for run in list_live_runs():
         try:

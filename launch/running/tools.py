@@ -42,10 +42,10 @@ class ToolCounts:
 
 
 def tools_host(run: Run) -> str:
-    """Return the name that this computer has in a run's launch file.
+    """Return the host name in the launch file whose keys and permissions command-line tools use.
 
-    It is the host whose nodes the run started, or `MAIN` if the run started the nodes of all hosts.
-    Command-line tools use the keys and the permissions of this host.
+    This is the host whose nodes were started on this computer. If the nodes of all hosts were
+    started, it is `MAIN`.
     """
     return run.host or MAIN
 

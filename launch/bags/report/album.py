@@ -40,9 +40,10 @@ class Album:
     """A selection of image sets: sets at regular intervals, and the first set after each bookmark.
 
     limit: maximum number of image sets at regular intervals.
-    bookmarks: (time in s, label) of each bookmark, in the order of time.
+    bookmarks: time (s) and label of each bookmark, in chronological order.
     count: number of all image sets in the session.
-    left_out: number of image sets at bookmarks that are not stored.
+    left_out: number of image sets after bookmarks that are not stored, because too many such sets
+        are already stored.
     """
 
     limit: int
@@ -73,7 +74,7 @@ class Album:
         self.count += 1
 
     def shots(self) -> list[Shot]:
-        """Return the selected image sets in the order of time."""
+        """Return the selected image sets in chronological order."""
         return sorted((*self._regular, *self._at_bookmarks), key=lambda shot: shot.seconds)
 
 

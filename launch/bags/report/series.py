@@ -153,7 +153,7 @@ class States:
     def add(self, index: int, at_ns: int, state: str) -> bool:
         """Add a reported state, and return whether it differs from the previous state.
 
-        index: index of the interval.
+        index: index of the time interval that contains the report.
         at_ns: time of the report, ns.
         """
         if state not in self.seconds:

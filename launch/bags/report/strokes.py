@@ -67,11 +67,12 @@ class FingerRun:
     """A motion of the simulated finger along a path.
 
     zero_ns: start time of the path.
-    done_ns: time of the last exposure on the path.
-    end_ns: time of the last exposure at which the finger reports the path.
-    stroke_s: duration of the stroke of the finger; None if the path is not a stroke of an
-        experiment.
-    sums: errors during the stroke, relative to the measured finger and to the true finger.
+    done_ns: time of the last camera exposure during the motion.
+    end_ns: time of the last exposure before the finger gets another path. The finger rests at the
+        end of the path from `done_ns` to `end_ns`.
+    stroke_s: duration of the finger's stroke; None if the path is not a stroke of an experiment.
+    sums: statistics of the sheet's errors during the stroke, relative to the measured finger and to
+        the true finger.
     """
 
     label: str
