@@ -128,7 +128,7 @@ def node_class(name: str) -> type[Node]:
 
 
 def _describe_import_error(module: str, error: BaseException) -> tuple[str, str]:
-    """Return the location and the text of an error during an import, and an advice."""
+    """Return the text of an error during an import, and an instruction to correct the error."""
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
     if missing and (module == missing or module.startswith(f"{missing}.")):
         return str(error), (

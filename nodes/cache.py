@@ -43,9 +43,9 @@ def default_cache_dir() -> Path:
 
 
 def advise_precompute(scene: Scene, options: str = "") -> str:
-    """Return the advice to compute the missing tables of a scene, for the note of a node.
+    """Return a text that tells the user how to compute the missing tables of a scene.
 
-    options: options of the command, which start with a space.
+    options: further options of the command, which begin with a space.
     """
     command = f"flexsheet precompute SCENE{options}"
     return f'with the file of the scene "{scene.name}" as SCENE, run {command}'

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 class CommandScheduler:
     """A scheduler for the commands to one arm.
 
-    period_s: time between periodic commands.
-    target_period_s: time between targets.
+    period_s: time between periodic commands, which are sent even if no new target of the sheet
+        arrives.
+    target_period_s: time between targets of the sheet from the planner.
     idle_period_s: time between commands to an idle arm.
 
     In all methods, `sent_ns` is the time of the last command, or 0 before the first command.

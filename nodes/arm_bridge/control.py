@@ -491,7 +491,10 @@ class ArmControl:
         return self._move_to_target(goal, other, measured)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
-        """Return why the arm must stop without slackening the sheet, or None if it need not."""
+        """Return why the arm must stop without a motion that slackens the sheet.
+
+        Returns None if there is no reason for such a stop.
+        """
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if other is not None and other.estopped:

@@ -68,11 +68,13 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the motion of a target by `ahead_s`.
+    """Return the goal that results from extrapolating the motion of a target by `ahead_s`.
 
-    overdue_s: time since the next target was due. This time is increased if the extrapolation is
-        limited, or if the target is too far in the future.
+    overdue_s: time since the next target was due.
     max_extrapolation_s: maximum of the absolute extrapolation time.
+
+    If `ahead_s` exceeds this maximum, or if the target's timestamp is too far in the future,
+    `Goal.overdue_s` is increased. The arm then stops as it does when targets are overdue.
     """
     carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
     late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)

@@ -74,7 +74,11 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class SeedBranch(NamedTuple):
-    """A branch of an arm without closed-form kinematics, defined by one set of joint angles."""
+    """A branch of the inverse kinematics, represented by joint angles on this branch.
+
+    A branch is one of the discrete solutions for a flange pose. This class is used for arms without
+    closed-form kinematics.
+    """
 
     seed_rad: tuple[float, ...]
 
@@ -269,7 +273,7 @@ class NumericKinematics:
         return sorted(found, key=lambda one: float(np.abs(one - self._start).max()))
 
     def find_branch(self, joints_rad: Floats) -> SeedBranch:
-        """Return the branch to which joint angles (6,) rad belong."""
+        """Return the branch (discrete inverse-kinematics solution) of the joint angles (6,) rad."""
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:

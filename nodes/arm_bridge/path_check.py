@@ -149,7 +149,11 @@ class Alignment:
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return the motion that aligns this arm to the path, or the reason why the path is blocked."""
+    """Check whether both arms can move the sheet to its target.
+
+    Returns the joint motion that aligns this arm before the sheet moves, or a text that describes
+    why there is no path. After the alignment, the sheet is flat and on the path.
+    """
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
         return (

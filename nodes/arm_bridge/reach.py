@@ -82,7 +82,10 @@ class SheetPoses:
         return len(self.stretch_ratio)
 
     def some(self, chosen: NDArray[np.intp] | Bools) -> SheetPoses:
-        """Return the poses that an array of indices or booleans selects."""
+        """Return a subset of the poses.
+
+        chosen: indices of the poses, or a boolean mask (n,).
+        """
         return SheetPoses(
             self.world_from_sheet[chosen], self.stretch_ratio[chosen], self.twists_world[chosen]
         )
@@ -186,10 +189,14 @@ def _margins(
     others: Floats,
     places: SheetPoses,
 ) -> dict[str, Floats]:
-    """Return the margins (n,) of all limits for n poses of the sheet.
+    """Return one array of margins (n,) for each limit, by the name of the limit.
 
     joints: encoder angles (n, 6) rad.
     flanges, others: world poses (n, 4, 4) of this arm's flange and of the other arm's flange.
+    places: n poses of the sheet.
+
+    A margin is the distance to the limit, and is positive if the limit is met. Margins of speeds
+    are fractions of the maximum speed.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     without = np.full(len(joints), np.inf)
@@ -220,10 +227,12 @@ def _margins(
 def _speeds(
     geometry: ArmGeometry, joints: Floats, flanges: Floats, places: SheetPoses
 ) -> tuple[Floats, Floats]:
-    """Return the maximum joint speeds (n, 6), rad/s, and tool speeds (n,), m/s, over all twists.
+    """Return the maximum joint speeds (n, 6), rad/s, and tool speeds (n,), m/s, at n sheet poses.
 
     joints: encoder angles (n, 6), rad.
-    flanges: world poses (n, 4, 4) of the flange for n poses of the sheet.
+    flanges: world poses (n, 4, 4) of the flange.
+    places: n poses of the sheet, each with several twists (velocities) of the sheet. The maximum is
+        taken over these twists.
     """
     fastest, tool = np.zeros_like(joints), np.zeros(len(joints))
     centre = places.world_from_sheet[:, :3, 3]

@@ -186,7 +186,10 @@ class _LoopClock:
         self._newest_ns: int | None = None
 
     def continuous_ns(self, time_ns: int) -> int:
-        """Convert a time (ns) in the current pass to a time (ns) since the start of the clock."""
+        """Convert the time (ns) of an image in the file to a continuously increasing time (ns).
+
+        When the file is read again from its start, the returned time continues to increase.
+        """
         continuous_ns = self._start_ns + time_ns
         if self._newest_ns is not None:
             self._interval_ns = continuous_ns - self._newest_ns

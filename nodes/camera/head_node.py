@@ -180,10 +180,10 @@ class HeadCamera(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Publish invalid eye positions while no images arrive.
+        """Publish that the eye position is invalid if no images arrive.
 
-        The timestamp is `silence_s` in the past, and therefore older than the timestamp of an image
-        that is still being searched.
+        The message has a timestamp in the past, by the parameter `silence_s` plus the camera's
+        delay. Therefore it is older than the result of an image that is still being processed.
         """
         p = self.parameters
         at_ns = self.clock.now_ns() - round(1e9 * (p.delay_s + p.silence_s))

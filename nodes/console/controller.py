@@ -185,8 +185,8 @@ class EyeViewRequester:
     def on_scene(self, scene: Scene) -> None:
         """Apply the image correction that a new scene specifies.
 
-        A renderer that has received a display message ignores the correction of later scenes. If
-        the console has sent such a message, this method publishes the new correction.
+        If the console has sent display settings, the renderer ignores the correction in later
+        scenes. In this case, this method publishes display settings with the new correction.
         """
         self._by_scene = scene.methods.correction
         if self._owns_display and not self._borrowed:
@@ -232,7 +232,10 @@ class EyeViewRequester:
         self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:
-        """Enter the state TRACING if a frame contains the requested pixels."""
+        """Enter the state TRACING if a frame contains the pixels that this console requested.
+
+        In this state, the simulated eye computes the view from the frame.
+        """
         if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
             self._enter(EyeViewState.TRACING, now_s)
 
@@ -331,12 +334,12 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """A publisher of e-stops, recording requests and bookmarks, which saves the console's state.
+    """The controller of the console, which publishes e-stops, recording requests and bookmarks.
 
     warn: function that receives an error text if the saved state cannot be used.
 
-    After a restart, the console continues with the saved scene, slider positions, finger position
-    and recording request.
+    The state is saved. After a restart, the console continues with the saved scene, slider
+    positions, finger position and recording request.
     """
 
     def __init__(

@@ -1,4 +1,7 @@
-"""Read the constant properties of the graph that the console needs from the plan of a run."""
+"""Read properties of the node graph from the plan file of a run.
+
+The console needs these properties. They are constant during a run.
+"""
 
 from __future__ import annotations
 
