@@ -64,9 +64,9 @@ MAX_DISPLACEMENT = "largest_move_mm"
 
 
 class SkinSolution(Protocol):
-    """The interface of a method's result for one push.
+    """A soft-body solution for one push, as any of the methods returns it.
 
-    It consists of the displacement (s, 3), m, of the s skin nodes, and the force (3,), N.
+    displacement (s, 3): displacement of the s skin nodes, m. force_n (3,): force, N.
     """
 
     @property
@@ -80,10 +80,13 @@ class SkinSolution(Protocol):
 class SoftBodyBenchmark:
     """A benchmark of the soft-body methods for pushes at one surface point of a scene's object.
 
-    depths_m: push depths. linear_m, table_m: distance between skin nodes (m) for each linear method
-    and each table. The keys are the names of the methods. newton_m: depths at which the time of
-    full Newton solutions is measured. focused: skin spacings of the reference meshes that are fine
-    only near the finger, in finger radii. even_m: skin spacings of the even reference meshes, m.
+    depths_m: push depths.
+    linear_m, table_m: distances between skin nodes (m) of the linear methods and of the nonlinear
+        tables. The keys are the names of the methods.
+    newton_m: depths at which the time of full Newton solutions is measured.
+    focused: distances between skin nodes of the reference meshes that are fine only near the
+        finger, in finger radii.
+    even_m: distances between skin nodes (m) of the reference meshes with uniform spacing.
     """
 
     scene: Scene
@@ -96,9 +99,9 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the body with its linear method, and its precomputed model (cached if possible).
+        """Return the soft body with the linear method, and its precomputed linear response.
 
-        spacing_m: distance between skin nodes.
+        The response is loaded from the cache if possible. spacing_m: distance between skin nodes.
         """
         spec = make_soft_body_spec(self.scene, spacing_m)
 
@@ -324,9 +327,10 @@ def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
 
 
 def _family(methods: Sequence[str], **changes: Any) -> Family:
-    """Return the benchmark of some soft-body methods.
+    """Define a benchmark of soft-body methods for the benchmark charts.
 
-    changes: changed fields of the `SoftBodyBenchmark`.
+    methods: names of the methods that are measured.
+    changes: values that replace fields of the default `SoftBodyBenchmark`.
     """
 
     def benchmark(scene: Scene) -> SoftBodyBenchmark:

@@ -77,7 +77,7 @@ def make_soft_body_spec(
 
 
 def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
-    """Return the inputs from which the nonlinear table of a body is computed."""
+    """Return the inputs from which a soft body's table of nonlinear push responses is computed."""
     return TableSpec(spec, scene.finger.radius_m)
 
 
@@ -152,10 +152,11 @@ class SceneBody:
         horizon_s: float = 0.0,
         replaced: Sequence[SceneBody] = (),
     ) -> SoftBody:
-        """Return the message about a response, with vectors in the world frame.
+        """Return the message with a response of this soft body, with vectors in the world frame.
 
-        horizon_s: time from the camera exposure to the predicted fingertip position. replaced:
-        earlier bodies that still contribute to the response during a gradual transition.
+        horizon_s: time from the camera exposure to the predicted fingertip position.
+        replaced: previous soft bodies, for example of a less accurate method. During a transition,
+            they still contribute to the response.
         """
         errors = [one.force_error_ratio(response.push_depth_m) for one in (self, *replaced)]
         rotation = self.world_from_mesh[:3, :3]

@@ -218,7 +218,10 @@ class FemSolver(Node):
         self.soft_body.publish(message, source_ns=header.source_ns)
 
     def _end_transitions(self) -> None:
-        """Remove the replaced soft bodies that no longer contribute to the responses."""
+        """Remove previous soft bodies whose transition to the present soft body has ended.
+
+        During a transition, the responses of both soft bodies are blended.
+        """
         if not self._replaced:
             return
         begin_ns = self.clock.now_ns() - round(1e9 * BLEND_S)

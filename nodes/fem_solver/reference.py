@@ -74,10 +74,11 @@ class ReferenceSolution:
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job (inputs) for pushes at a surface point on a mesh that is fine near it.
+    """Return the inputs of a Newton solution for pushes at a point, on a locally refined mesh.
 
-    ratio: distance between skin nodes near the point, in finger radii. If the shape does not
-    support such meshes, all touchable skin has this spacing.
+    ratio: distance between skin nodes near this point, in finger radii. If the shape does not
+        support locally refined meshes, all touchable skin has this spacing.
+    depths_m: push depths.
     """
     spacing = ratio * scene.finger.radius_m
     spec = body.spec.mesh
@@ -97,7 +98,11 @@ def make_focused_job(
 def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job (inputs) for pushes at a surface point on a mesh with even skin spacing."""
+    """Return the inputs of a Newton solution for pushes at a point, on a mesh of uniform spacing.
+
+    spacing_m: distance between skin nodes.
+    depths_m: push depths.
+    """
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
     return snapshots.make_job_on_mesh(
         mesh,

@@ -109,12 +109,15 @@ class SnapshotInterpolator:
         self._rest: Floats | None = None
 
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats, float]:
-        """Interpolate the snapshots at a new sample point.
+        """Interpolate the stored push solutions (snapshots) to another surface point.
 
+        sample: this surface point and its normal.
         rest (s, 3): undeformed positions of the s skin nodes, m. Calls with the same array are
-        faster. Return the displacement (k, s, 3), m, and the force (k, 3), N, at k depths for a
-        Young's modulus of 1 Pa. The last result is the weighted mean number of depths at which the
-        snapshots converged.
+            faster.
+
+        Returns the displacement (k, s, 3), m, and the force (k, 3), N, at k depths for a Young's
+        modulus of 1 Pa. A third result is the number of depths at which the snapshots converged, as
+        a weighted mean over the snapshots.
         """
         if rest is not self._rest:
             self._rest, self._fixed = rest, {}
@@ -196,10 +199,13 @@ def _tangents(towards_user: Floats) -> list[int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SnapshotSet:
-    """The snapshots at sample points, from which a worker makes an interpolator.
+    """A set of push solutions (snapshots) that a worker process receives to make an interpolator.
 
-    mirrors: vectors (3,) of signs, one for each mirror symmetry of the body. towards_user (3,):
-    unit vector that is not opposite to any normal. radius_m: radius of the finger.
+    samples, solved: surface points of the pushes, and the solutions.
+    mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
+    towards_user (3,): unit vector towards the user. No surface normal at a sample may point in the
+        opposite direction.
+    radius_m: radius of the finger.
     """
 
     samples: Sequence[SamplePoint]

@@ -119,7 +119,7 @@ class SoftBodyFactory:
     ) -> str:
         """Return a note for the user if the scene's nonlinear table is missing, or an empty text.
 
-        made: soft bodies that `bodies` has built for the scene.
+        made: soft bodies that were built for the scene, one for each available method.
         """
         choice = scene.methods.soft_body
         waits_for_table = (
