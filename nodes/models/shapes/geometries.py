@@ -35,7 +35,8 @@ class CuboidMap:
     """A map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
 
     half_m: half extents (3,) of the solid.
-    inner_m: half extents (3,) of the undistorted lattice of the mesh.
+    inner_m: half extents (3,) of the inner part of the mesh, which is an undistorted lattice of
+        cells.
     surface: function that maps points (n, 3) on the cube to points (n, 3), in m, on the solid.
     is_round: whether the whole surface is curved, as on an ellipsoid; false if it has flat faces.
     """
@@ -68,14 +69,19 @@ class GeometryDescription:
 
 
 def map_round_solid(half_m: Floats) -> CuboidMap:
-    """Return the map for meshing an ellipsoid with half extents (3,), m, centred on the origin."""
+    """Return the map from a cube to an ellipsoid that is used to mesh the ellipsoid.
+
+    half_m: half extents (3,) of the ellipsoid, which is centred on the origin, m.
+    """
     return CuboidMap(half_m, INNER_RATIO * half_m, lambda w: half_m * cube_to_sphere(w), True)
 
 
 def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
-    """Return a map for meshing, from the surface of a box to the nearest points on `shape`.
+    """Return the map from a cube to a solid that is used to mesh the solid.
 
-    half_m (3,): half extents of the box.
+    Each point of the cube's surface, scaled to a box, is mapped to the nearest point on `shape`.
+
+    half_m (3,): half extents of the box, m.
     """
     return CuboidMap(half_m, half_m, lambda w: shape.closest(half_m * w).point, False)
 

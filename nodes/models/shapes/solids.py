@@ -199,8 +199,9 @@ class EllipsoidShape(Convex):
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
         """Evaluate a quadratic function of one point (3,) that is zero on the ellipsoid.
 
-        Return its value, gradient and Hessian, and the support 1. Python numbers are used for
-        speed; `_level` evaluates the same function for arrays of points.
+        Returns the value, the gradient, the Hessian and the number 1, which means that the function
+        is valid everywhere. Python numbers are used for speed. The method `_level` evaluates the
+        same function for arrays of points.
         """
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
@@ -358,11 +359,14 @@ def _outer(normal: Floats) -> Floats:
 def _directions(
     offsets: Floats, previous: ArrayLike | None, queries: Floats, *, across: tuple[int, ...]
 ) -> tuple[Floats, Floats, Bools]:
-    """Return unit directions and lengths of offsets (..., 3), and whether each offset is zero.
+    """Return unit directions and lengths of vectors (..., 3), and whether each vector is zero.
 
-    across: indices of the coordinates in which the offsets can differ from zero. If an offset is
-        zero, its direction is the direction from the origin to the previous point, or `FRONT` if
-        there is no previous point.
+    offsets: vectors from an axis or centre of a solid to queries.
+    previous: previous nearest points of the queries, or None.
+    across: indices of the coordinates in which the vectors can differ from zero.
+
+    A zero vector has no direction. Instead, the direction to the previous nearest point is
+    returned, or `FRONT` if there is none.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)

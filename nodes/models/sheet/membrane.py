@@ -405,7 +405,9 @@ class _FingerContact:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium by scaling the current deflection; start with a cone.
+    """Predict the equilibrium at the next push depth, as the initial guess of the solver.
+
+    The current deflection is scaled with the depth. If the depth is 0, the prediction is a cone.
 
     push: current depth and its increase in this step (m).
     """
