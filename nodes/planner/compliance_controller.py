@@ -104,8 +104,9 @@ class ComplianceController:
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
         """Set the delay from the measurement of a depth to the motion of the sheet.
 
-        If the new delay changes the stability bounds of the offset, stretch and offset are fitted
-        to the object's force curve again. They are not fitted while the finger touches the sheet.
+        The stability bounds of the sheet's offset depend on this delay. If the bounds change, the
+        stretch and the offset are computed again from the object's force curve. While the finger
+        touches the sheet, the bounds are not changed.
         """
         self.delay_s = delay_s
         if self._bounds is None or in_contact:

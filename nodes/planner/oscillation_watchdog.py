@@ -47,7 +47,7 @@ class OscillationWatchdog:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all measurements, and set the weight of the offset's motion to 1."""
+        """Discard all measurements, and allow the full motion of the sheet's offset again."""
         self.weight = 1.0
         self._slow: tuple[float, float] | None = None
         self._last = (0.0, 0.0)
@@ -56,9 +56,12 @@ class OscillationWatchdog:
         self._fading = False
 
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
-        """Process a new measurement, and return the weight (0 to 1) of the offset's motion.
+        """Process a new measurement, and return the factor by which the offset's motion is scaled.
 
-        depth_m: measured depth.
+        The factor is 1 in normal operation. If the sheet's motion drives an oscillation of the
+        finger, the factor decreases to 0.
+
+        depth_m: measured depth of the finger.
         offset_m: offset of the sheet at the time of the measurement.
         step_s: time since the last measurement.
         """

@@ -106,8 +106,8 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
     home: axes (3, 3) of the sheet before they are rotated to the surface normal.
     half_width_m: maximum distance of the contact from the sheet's centre.
 
-    The contact is on the sheet's horizontal centre line. Within the maximum distance, the sheet's
-    centre is aligned with the object's origin along the sheet's x axis.
+    The contact is on the sheet's horizontal centre line. Along this line, the sheet's centre is as
+    close as possible to the object's origin.
     """
     axes = transport_axes(home, found.normal)
     x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
@@ -137,8 +137,9 @@ def compute_tangent_twist(
     rate: velocity (3,) m/s of the surface point.
     home, half_width_m: as in `make_tangent_contact`.
 
-    With the surface normal n and the third axis h of `home`, the angular velocity of the sheet is n
-    x dn/dt plus -(h x n) . dn/dt / (1 + h . n) about the normal.
+    The angular velocity is n x dn/dt + s n. The first term rotates the surface normal n. The second
+    term is a spin about the normal with the rate s = -(h x n) . dn/dt / (1 + h . n). Here h is the
+    third axis of `home`.
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
     tangential = rate - normal * (rate @ normal)
@@ -164,10 +165,11 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
-    """Return the angle (rad) by which `axes` (3, 3) are rotated about their normal.
+    """Return the angle (rad) by which a sheet is rotated about its normal.
 
-    home: axes (3, 3) that define the angle 0. The smallest rotation that makes both normals equal
-        is applied to them first.
+    axes (3, 3): axes of the sheet as columns; the third column is the normal.
+    home (3, 3): axes of an unrotated sheet. Before the comparison, they are rotated by the smallest
+        rotation that makes their normal equal to the normal of `axes`.
     """
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
@@ -176,12 +178,14 @@ def measure_spin_rad(axes: Floats, home: Floats) -> float:
 def limit_tilt(
     shape: Shape, start: Nearest, found: Nearest, front: Floats, max_tilt_rad: float
 ) -> tuple[Nearest, bool]:
-    """Return the last surface point between `start` and `found` within the maximum tilt.
+    """Return the surface point nearest to `found` at which the sheet's tilt is within its limit.
 
-    front: unit vector (3,) from which the tilt is measured.
+    The points on the way from `start` to `found` are searched. They are projections of the straight
+    line between both points onto the surface.
 
-    The second result is whether the returned point differs from `found`. The search follows the
-    straight line to `found` in increasing steps, and projects each step onto the surface.
+    front: unit vector (3,) from which the tilt of the surface normal is measured.
+
+    The second result is whether the returned point differs from `found`.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
     if found.normal @ front >= limit:

@@ -92,9 +92,10 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """List copies of a scene that have a stored finger radius and sheet width, with their weights.
+    """List the finger radii and sheet widths whose stored shapes are interpolated for a scene.
 
-    The weighted sum of their deflection shapes interpolates the shapes of the scene.
+    Returns pairs of a weight and a copy of the scene with a stored radius and width. The sum of the
+    deflection shapes, multiplied by the weights, approximates the shapes of the scene.
     """
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
@@ -111,7 +112,13 @@ def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
 
 
 def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> IndentationBasis:
-    """Return a scene's deflection shapes: the weighted sum of stored shapes, scaled in width."""
+    """Interpolate a scene's deflection shapes from stored shapes of similar scenes.
+
+    parts: pairs of a weight and stored shapes.
+
+    The stored shapes are added with their weights. They are scaled along x to the width of the
+    scene's sheet.
+    """
     rubber, _ = required_shapes(scene)
     stored = parts[0][1]
     wider = rubber.width_m / stored.rubber.width_m

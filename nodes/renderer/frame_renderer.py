@@ -174,9 +174,10 @@ class FrameRenderer:
         return self.scene_renderer.place_check_marks(sheet)
 
     def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
-        """Return the message of a frame with its measured display times.
+        """Add the measured display times to the message of a frame, and return the message.
 
-        swapped_ns: time of the swap; 0 if a newer frame replaced the frame.
+        swapped_ns: time of the buffer swap that showed the frame; 0 if the frame was never shown,
+            because a newer frame replaced it.
         """
         if not swapped_ns:
             self.superseded += 1
@@ -191,8 +192,8 @@ class FrameRenderer:
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the drawn object as predicted for the display time `light_ns`.
 
-        If the last response of the soft-body solver is not recent, it is used without prediction.
-        Return two times (ns): the exposure time of the camera image from which the deformation was
+        If the soft-body solver's last response is too old, its deformation is not extrapolated.
+        Returns two times (ns): the exposure time of the camera image from which the deformation was
         computed, and the time for which the deformation was predicted.
         """
         ports, scene_renderer = self._ports, self.scene_renderer

@@ -94,9 +94,9 @@ class Presenter:
             )
 
     def put(self, slot: Slot) -> None:
-        """Pass a completely drawn slot to the thread, and return immediately.
+        """Pass a completely drawn frame to the display thread, and return immediately.
 
-        The thread shows the slot at the next refresh, unless a newer slot replaces it.
+        The thread shows the frame at the next refresh, unless a newer frame replaces it.
         """
         with self._changed:
             superseded, self._ready = self._ready, slot
@@ -175,9 +175,10 @@ class Presenter:
 
 
 class _WindowQuad:
-    """The shader program that draws the image of a slot in the window.
+    """The shader program that draws a finished frame in the window.
 
-    Blocking OpenGL functions are called through ctypes, which releases the interpreter lock.
+    OpenGL functions that block are called through ctypes, so that other Python threads can run
+    meanwhile.
     """
 
     def __init__(self, slots: list[Slot]) -> None:

@@ -103,11 +103,14 @@ class SceneRenderer:
     ) -> None:
         """Create the graphics objects of the scene.
 
-        spacing_m: distance between the vertices of the object. samples: samples per pixel. If it is
-        None, `SAMPLES` is used. With a software driver, the first pass of two_pass then uses no
-        multisampling. basis: deflection shapes of the sheet; if it is None, a pushed sheet is drawn
-        as four triangles. sheet_shape: method that computes the shape of the sheet. Raises
-        ValueError if the projector's lens maps several rays to one pixel.
+        spacing_m: distance between the vertices of the object.
+        samples: samples per pixel. If it is None, `SAMPLES` is used. With a software OpenGL driver,
+            the first pass of the correction method two_pass then has only one sample per pixel.
+        basis: precomputed deflection shapes of the sheet; if it is None, a pushed sheet is drawn as
+            four triangles.
+        sheet_shape: method that computes the shape of the sheet.
+
+        Raises ValueError if the projector's lens maps several rays to one pixel.
         """
         projector, geometry = require_projector(scene), scene.object.geometry
         self.scene = scene
@@ -314,11 +317,13 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image by the method two_pass on a given mesh of the sheet.
+        """Draw the projector's image by the correction method two_pass on a mesh of the sheet.
 
-        Return an array (height, width, 3) if `read` is true, otherwise None. eyes (1 or 2, 3):
-        positions, world frame, m; None for the eyes of the scene. drawn: function that receives the
-        index of each finished image.
+        read: whether to return the image as an array (height, width, 3). If it is false, None is
+            returned.
+        eyes (1 or 2, 3): positions of the eyes, world frame, m. If it is None, the scene's eyes are
+            used.
+        drawn: function that is called after each image is finished, with the index of the image.
         """
         whole = self.canvas.width_px, self.canvas.height_px
 
@@ -397,7 +402,10 @@ class SceneRenderer:
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a warning if the push is too deep for four triangles, otherwise an empty text."""
+        """Return a warning if the push is too deep to represent the sheet by four triangles.
+
+        Otherwise, return an empty text.
+        """
         if sheet.pushed_point is None:
             return ""
         depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])

@@ -1,4 +1,4 @@
-"""Estimate the sheet's pose, and derive the screen for which the projected image is corrected."""
+"""Estimate the sheet's pose and shape, for which the renderer corrects the projected image."""
 
 from __future__ import annotations
 
