@@ -174,7 +174,13 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """The arguments of `detect_all`. Images and origins are pairs (left, right)."""
+    """The arguments of `detect_all`.
+
+    images: left and right image, which can be cut-outs of the camera images.
+    origins: position (x, y), px, of each image's first pixel in the camera image.
+    volume: minimum and maximum corner (3,), m, of the finger's working volume in the world frame.
+    gate: ball in which the finger's marker is expected; None if the finger is not tracked.
+    """
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
@@ -222,9 +228,10 @@ def detect_all(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the window of each image that shows the gate.
+    """Return the windows of the left and right image in which the finger's marker is expected.
 
-    Returns (None, None) if there is no gate, or if an image does not show the gate.
+    The windows contain the image of the gate, which is a ball around the predicted position.
+    Returns (None, None) if there is no gate, or if it is outside an image.
     """
     if inputs.gate is None:
         return None, None
@@ -251,9 +258,9 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
 def _match_in(
     inputs: DetectionInput, windows: tuple[Window | None, Window | None]
 ) -> StereoDetection:
-    """Match the blobs of one window of each image, and select the finger's marker.
+    """Detect blobs in both images, match them as stereo pairs, and select the finger's marker.
 
-    windows: windows of the left and right image; None means the full image.
+    windows: windows of the left and right image that are searched; None means the full image.
     """
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
@@ -347,9 +354,10 @@ class RefinedPair:
 
 
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
-    """Select the finger's marker from pairs of blobs that are likely markers.
+    """Select the finger's marker from blob pairs that probably show round markers.
 
-    Pairs that are not round markers are refined again as flat markers that are seen at an angle.
+    A pair may fail the checks of a round marker after its refinement to subpixel accuracy. It is
+    then refined a second time as a flat marker that is seen at an angle.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
@@ -372,7 +380,10 @@ def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetect
 
 
 def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[RefinedPair]:
-    """Refine the markers of blob pairs, and sort the pairs by their cost before the refinement."""
+    """Refine the markers of blob pairs to subpixel accuracy.
+
+    The result is in the order of the costs that the pairs had before the refinement.
+    """
     ordered = sorted(pairs, key=lambda pair: pair.cost)
     found = []
     for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
@@ -451,10 +462,11 @@ def _flat_pose(
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the valid markers of blob pairs after the refinement, sorted by cost.
+    """Return the valid markers of refined blob pairs, sorted by cost, without false pairs.
 
-    A pair is dropped if its blobs probably show two different markers. Then both blobs belong to
-    pairs with lower costs, or one blob belongs to a pair with a much lower cost.
+    Two markers in both images can form four pairs, of which two are false. A pair counts as false
+    if each of its blobs also belongs to a pair with a lower cost. It also counts as false if one
+    blob belongs to a pair with a much lower cost.
     """
     unique: list[RefinedPair] = []
     for one in sorted(

@@ -234,7 +234,10 @@ class OscInput(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Reopen a closed port, and publish invalid messages for inputs that receive no data."""
+        """Reopen a closed port, and report inputs that receive no data.
+
+        For such an input, a message that is marked as invalid is published.
+        """
         if self.transport is None:
             await self._open()
         else:

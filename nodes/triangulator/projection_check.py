@@ -161,9 +161,13 @@ class ProjectionCheck:
         return np.asarray(np.where(on_sheet[:, None], (now - before) / step_s, np.nan))
 
     def _add_surface(self, heights_m: Floats, ratios: Floats, at_ns: int) -> None:
-        """Add the heights (n,), m, of marks above the expected sheet to the residual monitors.
+        """Check the heights (n,), m, of projected marks above the expected surface of the sheet.
 
-        ratios: displacements (n,) of the marks as fractions of the finger's displacement.
+        ratios: displacements (n,) of the sheet at the marks as fractions of the finger's
+            displacement; 0 for marks that the finger does not move.
+
+        The heights consist of an error of the sheet's height, and of an error of the finger's depth
+        times these ratios. Both errors are estimated and added to their residual monitors.
         """
         if not ratios.any():
             self._surface.add(np.array([heights_m.mean()]), at_ns)
@@ -206,9 +210,11 @@ class ProjectionCheck:
 def make_check(
     cause: SuspectedCause, monitor: ResidualMonitor, *, suspected: bool | None = None
 ) -> SelfCheck:
-    """Make the result of a self-check from the monitor of its residual.
+    """Return the result of a self-check as a message part.
 
-    suspected: whether the cause is suspected; None if the monitor decides.
+    cause: error that the self-check can detect.
+    monitor: statistics of the residual from which the error is detected.
+    suspected: whether the error is suspected; None if the monitor decides.
     """
     is_latency = cause == "display_latency"
     return SelfCheck(

@@ -62,9 +62,12 @@ class PositionMeasurement:
     covariance: Floats
 
     def can_reach(self, later: PositionMeasurement, max_speed: float) -> bool:
-        """Return whether a finger can move from this point to a later point, despite noise.
+        """Return whether a finger can move from this measured point to a later measured point.
 
         max_speed: maximum speed of the finger, m/s.
+
+        The distance may exceed the distance at maximum speed by GATE_SIGMAS standard deviations of
+        the measurement noise.
         """
         distance = float(np.linalg.norm(later.measured - self.measured))
         noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
@@ -79,7 +82,11 @@ class Gate:
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Return whether the true position of a measured point can be inside the gate."""
+        """Return whether a measured point can be in the gate, given its uncertainty.
+
+        The distance from the centre may exceed the radius by GATE_SIGMAS standard deviations of the
+        noise.
+        """
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
@@ -271,7 +278,11 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Return `previous` with a new point appended, or only this point if it does not fit."""
+        """Append a point to a run of successive points, or begin a new run with this point.
+
+        A new run begins if the finger cannot move from the last point to the new point. It also
+        begins if the new point is not later, or is later by more than the time-out of a track.
+        """
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]
