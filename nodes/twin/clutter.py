@@ -26,10 +26,14 @@ its marker from the cameras."""
 
 
 class Trajectory(Protocol):
-    """The interface of a position as a function of simulation time."""
+    """The motion of a clutter object: its position as a function of the simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the position (3,), m, in the world frame or relative to the fingertip."""
+        """Return the position (3,), m, at a simulation time.
+
+        For objects that are carried by the hand, the position is relative to the fingertip. For
+        other objects, it is in the world frame.
+        """
         ...
 
 

@@ -69,12 +69,13 @@ class TwinEyeParameters(SimulatorParameters):
 
 
 class TwinEyeNode(Node):
-    """A node that renders the eye's image of labelled frames.
+    """A node that simulates the image that the user's eye sees of a displayed frame.
 
-    An image takes about a second to render. Therefore the node renders one frame per label,
-    correction method and eye, and ignores further frames. It renders only frames that contain the
-    pixels of a single view. A mono frame is rendered from the viewpoint in the parameters. A frame
-    for one eye is rendered from the position of this eye.
+    Only frames with a label are simulated. An experiment labels the frames that it evaluates. An
+    image takes about a second to render. Therefore the node renders one frame per label, correction
+    method and eye, and ignores further frames. The frame must contain its pixels, drawn for one
+    viewpoint only. If it was drawn for one eye, the viewpoint is the position of this eye.
+    Otherwise the viewpoint in the parameters is used.
 
     The sheet is rendered as it is when the projector shows the frame, a few milliseconds after the
     frame arrives. The finger position is taken from the latest exposure. The deformation is the

@@ -81,7 +81,10 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """Return the time (s) at which the finger leaves the first point; it is at most 0."""
+        """Return the time (s) at which the finger leaves the first point.
+
+        The time is at most 0. It is negative if rounded corners make the motion start earlier.
+        """
         ...
 
     def speeds(self) -> Floats:
@@ -306,7 +309,8 @@ class FingerMotion:
     ) -> FingerMotion:
         """Make the motion of a finger that rests at `position` (3,), m.
 
-        seed: random seed of the deviations on later paths.
+        seed: seed of the random wander and tremor that are added when the finger follows later
+            paths.
         """
         generator = np.random.default_rng(seed)
         return FingerMotion(

@@ -111,7 +111,11 @@ def _sampled_times(duration_s: float) -> Floats:
 
 
 def touched(motion: Sampled) -> Sampled:
-    """Return a motion on the surface with an approach from above, short rests and a lift added."""
+    """Extend a motion on the surface by an approach and a lift.
+
+    The finger approaches the first point from above and rests briefly. After the motion, it rests
+    again and is lifted.
+    """
     times, places = motion
     first, last = places[0], places[-1]
     above_first, above_last = (np.array([*place[:2], HOVER_M]) for place in (first, last))
@@ -214,7 +218,10 @@ def tap(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Return a path of taps as fast as people can: 5.4 a second, with 85 ms of contact each."""
+    """Return a path of taps at the fastest rate of people: 5.4 taps per second.
+
+    In each tap, the finger is in contact for 85 ms.
+    """
     return _taps(
         scene, "tap-fast", count=25, every_s=0.185, contact_s=0.085, lift_m=0.006, seed=seed
     )
@@ -316,7 +323,10 @@ def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _touch_along(arcs: Floats) -> Floats:
-    """Return surface positions (n, 3) of a light touch at arc lengths (n,), m."""
+    """Return the surface positions (n, 3) of a finger that lightly presses the centre line.
+
+    arcs: distances (n,) along the centre line, m.
+    """
     return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -TOUCH_M)], axis=1)
 
 

@@ -187,8 +187,8 @@ class CoupledFinger:
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
         """Return a copy of this simulation, advanced to `time_s`.
 
-        If this simulation is more than MAX_PREDICTION_S behind `time_s`, it is first advanced
-        until it is MAX_PREDICTION_S behind.
+        The copy predicts at most MAX_PREDICTION_S. If this simulation is further behind `time_s`,
+        it is itself advanced first.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)

@@ -138,9 +138,13 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines for the surface points as functions of the distances `along` and `arc`, m.
+        """Fit splines that map two coordinates on the object's surface to surface points.
 
-        In both coordinates, the splines cover 1.25 times the touchable length.
+        The coordinates are the distances `along` and `arc`, m, from the point `front` in
+        perpendicular directions. In each direction, the splines cover 1.25 times the length that
+        the finger can touch.
+
+        heading (3,): direction of the coordinate `along` at `front`.
         """
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
@@ -209,7 +213,10 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
 
 
 def _surface_map_of(scene: Scene) -> SurfaceMap:
-    """Return the surface map of a scene. The maps of the latest scenes are cached."""
+    """Return the map from surface coordinates to world points for a scene's object.
+
+    The maps of the latest scenes are cached.
+    """
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
     if key not in _SURFACE_MAPS:
         while len(_SURFACE_MAPS) >= MAX_CACHED_SURFACE_MAPS:
@@ -341,7 +348,10 @@ def _soft_max(values: Floats, floor: float, bend: float) -> Floats:
 
 
 def _soft_clip(values: Floats, half: float) -> Floats:
-    """Limit values (n,) smoothly to +-half. The transition has the width 0.2 half."""
+    """Limit values (n,) smoothly to the range from -half to half.
+
+    The width of the transition at each limit is 0.2 * half.
+    """
     return -_soft_max(-_soft_max(values, -half, 0.2 * half), -half, 0.2 * half)
 
 

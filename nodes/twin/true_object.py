@@ -100,9 +100,11 @@ class TrueBody:
     def _on_skin(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
     ) -> tuple[Indices, Floats]:
-        """Return the indices (v, 3) and weights (v, 3) of three skin vertices per object vertex.
+        """Return the skin triangle that moves each vertex of the displayed object.
 
-        Both arrays are cached until the skin changes.
+        The skin is the surface mesh of the soft-body solver. For each of v object vertices, the
+        result contains the indices of the three corners (v, 3) and their interpolation weights (v,
+        3). It is cached until the skin changes.
         """
         key = skin_vertices.tobytes() + skin_triangles.tobytes()
         if self._skin is None or self._skin[0] != key:
@@ -218,7 +220,7 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return vertices, and the triangles that connect them to a closed surface.
+    """Return the vertices and the triangles of a closed surface around a centre.
 
     vertices (n, 3): one vertex in each direction that `_directions` returns, in the same order.
     """
