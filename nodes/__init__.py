@@ -145,7 +145,7 @@ def _describe_import_error(module: str, error: BaseException) -> tuple[str, str]
 def _locate_error(module: str, error: BaseException) -> str:
     """Return "file:line" of an error during the import of a module, or the name of the module.
 
-    If a library raises the error, this is the line that calls the library.
+    If a library raises the error, the result is the line of the module that calls the library.
     """
     import traceback  # imported here, because it is slow and only needed after an error
     from sysconfig import get_paths

@@ -130,14 +130,14 @@ def save_cached(specification: Specification[T], cache_dir: Path | None, result:
 
 
 def encode_fields(result: Any) -> dict[str, NDArray[Any]]:
-    """Return the array fields of a dataclass instance, by name."""
+    """Return the array fields of a dataclass instance as a dict with the field names as keys."""
     return {one.name: np.asarray(getattr(result, one.name)) for one in fields(result)}
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Return the arrays of a file by name, or None if the file does not exist or is damaged.
+    """Return the arrays of a file as a dict with their names as keys.
 
-    A damaged file is logged.
+    Returns None if the file does not exist or is damaged. A damaged file is logged.
     """
     try:
         # Reading a member of the archive to its end verifies its CRC-32.

@@ -82,14 +82,15 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 
 
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
-    """Return the angle (rad) by which an axis rotates to become parallel to a vector.
+    """Return the angle (rad) by which a joint rotates to make an axis parallel to a vector.
+
+    Near a singularity, the vector is short. The axis may then deviate from the vector, so that the
+    joint does not rotate fast. The joint rotates by at most MAX_FREE_ROTATION_RAD more than
+    necessary.
 
     along, across: components of the vector parallel and perpendicular to the axis.
-    fixed: length of the vector at which the angle between axis and vector may be 90 degrees.
-    near: length of the vector at which this angle must be 0.
-
-    The vector is short near a singularity. The axis may then deviate from the vector, and rotates
-    by at most MAX_FREE_ROTATION_RAD more than necessary.
+    fixed: length of the vector up to which the axis may even be perpendicular to the vector.
+    near: length of the vector from which the axis must be parallel to the vector.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -381,7 +382,7 @@ class ClosedFormKinematics:
         return found
 
     def find_branch(self, joints_rad: ArrayLike) -> Branch:
-        """Return the branch to which joint angles (6,) rad belong.
+        """Return the branch (discrete inverse-kinematics solution) of the joint angles (6,) rad.
 
         At a singularity, several branches match, and the first of them is returned.
         """
@@ -397,6 +398,7 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
+        branch: one of the discrete solutions of the inverse kinematics.
         near_rad: joint angles (6,) that select among angles which differ by whole revolutions.
 
         The angles may exceed the joint ranges. They are NaN if a pose is out of reach.

@@ -1,4 +1,8 @@
-"""Schedule the commands to an arm: one for each target, and periodic ones between targets."""
+"""Schedule the commands to an arm.
+
+A command is sent when a target of the sheet arrives. Between targets, commands are sent
+periodically.
+"""
 
 from __future__ import annotations
 

@@ -277,7 +277,7 @@ class NumericKinematics:
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
-        """Return the branches on which the arm can reach a flange pose.
+        """Return the branches (discrete inverse-kinematics solutions) that reach a flange pose.
 
         base_from_flange: n flange poses (n, 4, 4); the first pose that the arm can reach is used.
         """
@@ -291,6 +291,7 @@ class NumericKinematics:
     ) -> Floats:
         """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
+        branch: one of the discrete solutions of the inverse kinematics.
         near_rad: not used, because the branch determines the joint angles.
 
         The angles are NaN if a pose is out of reach.

@@ -58,7 +58,7 @@ class OtherArm:
         """Create the state of the other arm from a message of its bridge.
 
         age_s: age of the message.
-        target_source_ns: camera exposure from which the own arm's current target was computed.
+        target_source_ns: camera exposure from which this arm's current target was computed.
         now_ns: present time.
         ended: whether the other arm's bridge has ended.
         """

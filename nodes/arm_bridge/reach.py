@@ -99,6 +99,9 @@ class SheetPoses:
 class ArmReach:
     """The joint angles and margins of one arm for n poses of the sheet on one branch.
 
+    A branch is one of the discrete solutions of the inverse kinematics. A margin is the distance to
+    a limit, and is positive if the limit is met.
+
     joints_rad: encoder angles (n, 6); NaN for poses that are out of reach.
     margins: margins (n,) for each limit in `LIMITS`. Margins that depend on joint angles are NaN
         for poses that are out of reach. Margins are infinite for singularities that the arm does
@@ -163,8 +166,9 @@ def compute_reach(
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
     """Return the joint angles and margins on the branch that reaches the most poses.
 
-    Among branches that reach equally many poses, the branch with the larger margins is selected. An
-    arm cannot change its branch while the arm holds the sheet.
+    A branch is one of the discrete solutions of the inverse kinematics. Among branches that reach
+    equally many poses, the branch with the larger margins is selected. An arm cannot change its
+    branch while it holds the sheet.
     """
     still = places.without_twists().some(
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))

@@ -176,8 +176,8 @@ class VideoReader(FileReader):
 class _LoopClock:
     """A clock whose time continues to increase when a file is read again from its start.
 
-    The interval between two passes equals the interval between the last two images of the file, or
-    1 / rate_hz if the file has a single image.
+    Between the last image and the first image of the repetition, the time increases by the interval
+    between the last two images. If the file has a single image, the time increases by 1 / rate_hz.
     """
 
     def __init__(self, rate_hz: float) -> None:

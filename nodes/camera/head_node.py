@@ -87,8 +87,8 @@ class HeadCamera(Node):
     """A node that publishes the positions of the user's eyes from the images of a UVC camera.
 
     The distance of the eyes is computed from the interocular distance in the scene and from the
-    focal length. If the camera, its packages or a face are missing, the node publishes invalid
-    eyes. The renderer then uses the eye positions in the scene.
+    focal length. If the camera, its packages or a face are missing, the published message is marked
+    as invalid. The renderer then uses the eye positions in the scene.
     """
 
     opens_devices: ClassVar[bool] = True

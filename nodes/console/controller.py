@@ -148,12 +148,12 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """A requester of eye views. Only one is requested at a time, because ray tracing is slow.
+    """A requester of eye views, which are simulated images at the user's eye.
 
-    For each view, the renderer draws one frame and publishes its pixels. From this frame, the
-    simulated eye computes the view. Afterwards, the previous display settings are restored. If no
-    other node has sent display settings, the image correction of the scene or of the console is
-    restored.
+    Only one view is requested at a time, because ray tracing is slow. For each view, the renderer
+    draws one frame and publishes its pixels. From this frame, the simulated eye computes the view.
+    Afterwards, the previous display settings are restored. If no other node has sent display
+    settings, the image correction of the scene or of the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -240,7 +240,10 @@ class EyeViewRequester:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """End the request to which an image belongs; return whether this console requested it."""
+        """End the request that an image of the simulated eye answers.
+
+        Returns whether this console requested the image.
+        """
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels

@@ -19,8 +19,8 @@ from flexsheet.nodes import NodeRole
 class GraphFacts:
     """The properties of the graph that are constant while the console runs.
 
-    others_may_reset: other hosts that may reset an e-stop; empty if the console's own host may
-        reset it.
+    others_may_reset: hosts that may reset an e-stop if the console's own host may not; otherwise
+        empty.
     recorders: names of the recorder nodes.
     records_on_request: whether a recorder waits for a message on the topic `recording`.
     solvers: names of the nodes that publish the surface mesh of the soft object.

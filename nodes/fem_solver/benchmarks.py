@@ -132,7 +132,7 @@ class SoftBodyBenchmark:
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return the name and job (inputs) of each reference solution, most accurate first."""
+        """Return the name and the inputs of each reference solution, most accurate first."""
         body, sample = self.coarsest(), self.sample()
         jobs = []
         has_focused = snapshots.has_focused_meshes(body.spec.mesh)
@@ -149,9 +149,10 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return tables that cover only the skin near the push, by name of the method.
+        """Return nonlinear tables that cover only the skin near the push.
 
-        Methods whose full table is cached are omitted.
+        The keys of the result are the names of the methods. Methods whose full table is cached are
+        omitted.
         """
         found = {}
         for name, spacing in self.table_m.items():
@@ -263,11 +264,13 @@ class ReferenceSet:
         *,
         in_range: bool,
     ) -> Trial:
-        """Return the trial of a method at one push depth.
+        """Return the trial (measurement) of a method at one push depth.
 
-        rest (s, 3): undeformed positions of the s skin nodes, m. run: function that computes the
-        solution. in_range: whether the method is valid at this depth. The error is NaN if no
-        reference converged at the depth.
+        rest (s, 3): undeformed positions of the s skin nodes, m.
+        run: function that computes the solution.
+        in_range: whether the method is valid at this depth.
+
+        The error is NaN if no reference converged at the depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
         present = [one for one in self._references if one.reaches(depth_m)]

@@ -116,10 +116,12 @@ def make_even_job(
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:
-    """Load the solutions (snapshots) of jobs from the cache; compute and cache missing ones.
+    """Load push solutions (snapshots) from the cache; compute and cache the missing solutions.
 
-    on_progress: function that receives the number of finished jobs and the total number. Raises
-    OSError if a cache file cannot be read after it was written.
+    jobs: inputs of each solution.
+    on_progress: function that receives the number of finished jobs and the total number.
+
+    Raises OSError if a cache file cannot be read after it was written.
     """
     cache = CheckpointStore(cache_dir)
     names = [f"soft-body-push-{_digest(job)}" for job in jobs]

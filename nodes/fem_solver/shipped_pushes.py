@@ -26,7 +26,7 @@ LEVELS = 32767
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path at which the package may contain a file with the snapshots of a table."""
+    """Return the path of the file in which the package may contain push solutions for a table."""
     return FOLDER / entry.path(FOLDER).name
 
 

@@ -384,9 +384,10 @@ class TableSoftBody:
     ) -> None:
         """Precompute the force curves of all contact nodes.
 
-        bounds (b, 3): positions (m) of the b skin nodes that must not be touched. name: name of the
-        method in messages. push_depth_m: depth at which the force curve ends. linear_depth_m: depth
-        at which the stiffness is evaluated.
+        bounds (b, 3): positions (m) of the b skin nodes that the finger cannot touch.
+        name: name of the method in messages.
+        push_depth_m: depth at which the force curve ends.
+        linear_depth_m: depth at which the stiffness is evaluated.
         """
         self.name = name
         from scipy.linalg.blas import sgemv

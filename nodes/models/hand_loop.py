@@ -171,9 +171,10 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rate (k,), 1/s, of the slowest mode for each of k slopes (k,).
+    """Return the decay rates (k,), 1/s, of the slowest mode of the control loop for k slopes (k,).
 
-    A negative rate means that the mode grows.
+    A slope is the offset of the sheet along its normal, divided by the finger's depth. A negative
+    rate means that the mode grows.
     """
     matrices = make_loop_matrices(
         hand, loop, sheet_stiffness_n_per_m=sheet_stiffness_n_per_m, slopes=slopes
@@ -235,14 +236,18 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum stable slopes (n,) of an advance (motion towards the finger).
+        """Return the maximum stable slopes (n,) of sheet motion towards the finger.
+
+        A slope is the offset of the sheet along its normal, divided by the finger's depth.
 
         stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum stable slopes (n,) of a retreat (motion away from the finger).
+        """Return the maximum stable slopes (n,) of sheet motion away from the finger.
+
+        A slope is the offset of the sheet along its normal, divided by the finger's depth.
 
         stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
@@ -277,7 +282,7 @@ class OffsetBoundsTable:
     max_retreats: Floats
 
     def at_delay(self, delay_s: float) -> OffsetBounds:
-        """Return the bounds at the smallest delay in the table that is at least `delay_s`.
+        """Return the stability bounds for the smallest delay in the table of at least `delay_s`.
 
         The bounds are 0 if all delays of the table are smaller.
         """

@@ -148,7 +148,10 @@ class EdgeBound:
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0 to 1) for both speeds that keeps the edges within their limit."""
+        """Return the factor (0 to 1) for the sheet's linear and angular speed.
+
+        With this factor, no point of the clamped edges exceeds the maximum speed.
+        """
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 

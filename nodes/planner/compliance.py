@@ -145,7 +145,8 @@ class StretchLimits:
     """The limits of the sheet's stretch, edge force and offset.
 
     edge_force_n: maximum force on each clamp.
-    bounds: bounds on the slope of the offset; None if no hand is considered.
+    bounds: limits of the derivative of the offset with respect to the finger's depth. Within these
+        limits, the control loop with the hand is stable. None means that no hand is considered.
     """
 
     min_stretch_ratio: float

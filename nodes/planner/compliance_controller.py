@@ -44,8 +44,8 @@ class ComplianceController:
         uses the minimum stretch.
     hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle. None means
         that the value in the scene is used.
-    bounds: bounds on the offset's slope that keep the control loop with the hand stable; None if no
-        hand is considered.
+    bounds: limits of the derivative of the offset with respect to the finger's depth. Within these
+        limits, the control loop with the hand is stable. None means that no hand is considered.
     delay_s: time from the measurement of a depth until the sheet has moved.
     bandwidth_rad_per_s: bandwidth of the depth filter; None if there are no bounds.
     """

@@ -62,9 +62,10 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Return the cache key of a scene's deflection shapes, and functions for encoding and decoding.
+    """Define how a scene's deflection shapes are stored in the cache.
 
-    The shapes do not depend on the thickness and Young's modulus of the sheet.
+    The result consists of the cache key, and of functions that encode and decode the shapes. The
+    shapes do not depend on the thickness and Young's modulus of the sheet.
     """
     rubber, within = required_shapes(scene)
     depends_on = {

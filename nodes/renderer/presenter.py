@@ -85,7 +85,10 @@ class Presenter:
         self._thread.start()
 
     def free_slot(self) -> Slot:
-        """Return a slot for drawing. The slot is neither shown nor waiting to be shown."""
+        """Return a slot (textures of one frame) into which the next frame can be drawn.
+
+        The slot is neither shown nor waiting to be shown.
+        """
         with self._changed:
             return next(
                 slot
@@ -131,9 +134,9 @@ class Presenter:
             glfw.make_context_current(_NO_WINDOW)
 
     def _next(self) -> tuple[Slot, bool] | None:
-        """Wait for the next slot to show.
+        """Wait until a slot (textures of one frame) must be shown.
 
-        Return the slot and whether the slot is new. Return None if `stop` was called.
+        Returns the slot, and whether the slot is new. Returns None if `stop` was called.
         """
         with self._changed:
             while not self._stop:

@@ -123,8 +123,8 @@ class OscInputParameters(NodeParameters):
 class OscInput(Node):
     """A node that publishes the positions of the eyes and the fingertip that it receives by OSC.
 
-    If no messages arrive, the node publishes invalid eyes and fingertips. The renderer then uses
-    the eye positions in the scene.
+    If no messages arrive, the published messages are marked as invalid. The renderer then uses the
+    eye positions in the scene.
     """
 
     opens_devices: ClassVar[bool] = True

@@ -138,7 +138,7 @@ class Tracker:
         return "tracking" if at_ns == self.estimate.at_ns else "coasting"
 
     def gate(self, at_ns: int) -> Gate | None:
-        """Return the gate at a time after the newest point of the track.
+        """Return the gate, the ball in which the marker is expected, at a time.
 
         Returns None if the finger is not tracked, or if `at_ns` is not after the newest point.
         """

@@ -46,7 +46,7 @@ force."""
 
 
 class ForceHistory:
-    """The state of the hysteresis and creep of one force of the sheet.
+    """The state of hysteresis and creep for one force that the sheet exerts.
 
     hysteresis_ratio: fraction of the loading energy that is lost in a cycle from zero force. It
         includes the loss by creep.
@@ -64,7 +64,9 @@ class ForceHistory:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self | None:
-        """Make the force history from the true sheet parameters of an apparatus.
+        """Make the force history from the true sheet parameters.
+
+        apparatus: true parameters of the simulated hardware.
 
         Returns None if the sheet has neither hysteresis nor creep.
         """

@@ -127,8 +127,8 @@ class TrueBody:
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
     """Find the points of a mesh that are nearest to `points` (n, 3).
 
-    Returns the triangle corners (n, 3) and barycentric weights (n, 3) of the nearest points. Raises
-    ValueError if all triangles have zero area.
+    Each nearest point is given by the vertex indices of its triangle's corners (n, 3) and by
+    barycentric weights (n, 3). Raises ValueError if all triangles have zero area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):

@@ -174,9 +174,9 @@ class _Sizes:
 def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> Floats:
     """Return the x coordinates (s,), m, of the cross-sections, including both ends of the cylinder.
 
-    If the sizes have a focus (a point near which the mesh is fine), one cross-section is at the
-    focus. Within the distance `near_m` of the focus, the spacing is uniform. If x = 0 is a plane of
-    symmetry, only values x >= 0 are returned.
+    If the mesh is fine only near a focus (pushed point), one cross-section is at the focus. Within
+    the distance `near_m` of the focus, the spacing is uniform. If x = 0 is a plane of symmetry,
+    only values x >= 0 are returned.
     """
     half = 0.5 * length_m
     stops = [-half, half]

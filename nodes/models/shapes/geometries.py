@@ -57,8 +57,9 @@ class GeometryDescription:
     extent_m: function that returns how far (m) the touchable surface extends from the origin along
         a unit vector.
     scale: function that returns the dimensions multiplied by a ratio.
-    cuboid_map: function that returns the map for meshing; None if the shape is meshed by another
-        method. The arguments are the dimensions and the shape.
+    cuboid_map: function that returns the map from a cube to the solid, by which the solid is
+        meshed. The arguments are the dimensions and the shape. None means that another method
+        meshes the solid.
     """
 
     make_shape: Callable[..., Shape]

@@ -393,13 +393,13 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """List the jets (local quadratic fits) that have weight in the neighbourhood of each jet.
+        """List the local quadratic fits (jets) that influence the surface near each jet.
 
-        cover (j,): radius (m) of the neighbourhood of each jet.
+        cover (j,): radius (m) of the considered neighbourhood of each jet.
 
-        Return a table (j, k) of jet indices, and the number (j,) of valid entries in each row. Rows
-        are padded with the index of an additional jet that has no influence. This method appends
-        that jet.
+        Returns a table (j, k) of jet indices, and the number (j,) of valid entries in each row.
+        Rows are padded with the index of an additional jet that has no influence. This method
+        appends that jet.
         """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)

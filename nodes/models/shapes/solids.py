@@ -186,7 +186,8 @@ class EllipsoidShape(Convex):
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Evaluate a quadratic function of points (n, 3) that is zero on the ellipsoid.
 
-        The results are those of a `LevelSet`.
+        Returns values (n,), gradients (n, 3), Hessians (n, 3, 3), and the number 1 for each point.
+        The number means that the function is valid everywhere.
         """
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
