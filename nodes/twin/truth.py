@@ -47,8 +47,8 @@ class SimulatorParameters(NodeParameters):
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
     """Return by how much (s) a frame is displayed later than the renderer assumes.
 
-    The assumed latency is the time between drawing and displaying, according to the times in the
-    frame. If no frame has been displayed, the nominal latency is used.
+    The assumed latency is the time from the buffer swap to the display, according to the times in
+    the frame. If no frame has been displayed, the nominal latency is used.
 
     apparatus: true hardware parameters. If it is None, the result is 0.
     """
