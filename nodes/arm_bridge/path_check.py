@@ -193,11 +193,11 @@ def _check_alignment(
 ) -> None:
     """Raise PathError if a straight joint motion of both arms to the path is not permitted.
 
-    The motion is not permitted if a joint moves by more than MAX_ALIGN_RAD, or if a limit of the
-    sheet, of the distance between the flanges, or of the workspace is violated. A limit that is
-    already violated at the start is widened to slightly more than its value at the start.
-
     begin, there: joint angles of both arms at the start and at the end.
+
+    No joint may move by more than MAX_ALIGN_RAD. No limit of the sheet, of the distance between the
+    flanges, or of the workspace may be violated. A limit that is already violated at the start is
+    widened to slightly more than its value at the start.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)

@@ -193,7 +193,7 @@ def _margins(
     others: Floats,
     places: SheetPoses,
 ) -> dict[str, Floats]:
-    """Return one array of margins (n,) for each limit, by the name of the limit.
+    """Return the margins (n,) of each limit as a dict, with the names of the limits as keys.
 
     joints: encoder angles (n, 6) rad.
     flanges, others: world poses (n, 4, 4) of this arm's flange and of the other arm's flange.

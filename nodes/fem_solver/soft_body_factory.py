@@ -73,8 +73,8 @@ class SoftBodyFactory:
     ) -> list[body.SceneBody]:
         """Build the soft body of a scene for each available method, starting with the best method.
 
-        Raises UnfitMeshError if the object cannot be meshed, ValueError if the material, a size or
-        a depth is invalid, and MemoryError if the free memory is insufficient.
+        Raises UnfitMeshError if the object cannot be meshed, and MemoryError if the free memory is
+        insufficient. Raises ValueError if the material, a size or a depth is invalid.
         """
         spec = body.make_soft_body_spec(
             scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0

@@ -292,10 +292,11 @@ def _match_in(
 def _match_blobs(
     inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
 ) -> list[BlobPair]:
-    """Return all pairs of blobs whose rays are closest to each other in front of both cameras.
+    """Return the pairs of a left and a right blob that may show the same marker.
 
-    A pair receives a rejection reason if its reprojection error is too large or its radii are
-    wrong, or if it is outside the finger's working volume.
+    The rays of a pair are closest to each other in front of both cameras. A pair receives a
+    rejection reason if its reprojection error is too large, or if its radii are wrong. A pair
+    outside the finger's working volume also receives a rejection reason.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (

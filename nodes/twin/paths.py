@@ -163,8 +163,8 @@ class SurfaceMap:
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
     """Return the surface point nearest to a distant user.
 
-    If this point is on an end of the object, the result is the point that the user sees in the
-    direction of the object's origin.
+    This point can be on an end of the object. The result is then the point that the user sees in
+    the direction of the object's origin.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
