@@ -292,11 +292,11 @@ def _match_in(
 def _match_blobs(
     inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
 ) -> list[BlobPair]:
-    """Return the pairs of a left and a right blob that may show the same marker.
+    """Return all pairs of a left and a right blob that could show the same point.
 
-    The rays of a pair are closest to each other in front of both cameras. A pair receives a
-    rejection reason if its reprojection error is too large, or if its radii are wrong. A pair
-    outside the finger's working volume also receives a rejection reason.
+    The closest points of the two rays must be in front of both cameras. A pair receives a rejection
+    reason if its reprojection error is too large, or if its radii are wrong. A pair outside the
+    finger's working volume also receives a rejection reason.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
