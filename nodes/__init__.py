@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 
 
 class NodeRole(StrEnum):
-    """The role of a node in the graph, by which launcher, `flexsheet doctor` and replay select it.
+    """The role of a node in the graph.
 
-    A node class declares its role as the attribute `role`. A class that publishes ArmState is an
-    arm bridge by default.
+    The launcher, `flexsheet doctor` and the replay of bags use the role to find nodes, for example
+    the recorder. A node class declares its role as the attribute `role`. A class that publishes
+    ArmState is an arm bridge by default.
     """
 
     ARM_BRIDGE = "arm_bridge"

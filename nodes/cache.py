@@ -82,7 +82,7 @@ class Specification(Generic[T]):
         ) / f"{self.kind}-{make_digest(self.depends_on)}.npz"
 
     def checkpoints(self, cache_dir: Path | None) -> CheckpointStore:
-        """Return the store for checkpoints of the computation of this result.
+        """Return the store in which an interrupted computation saves its intermediate results.
 
         cache_dir: folder of the cache; None means the cache of the user.
         """

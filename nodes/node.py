@@ -267,7 +267,10 @@ def find_unmatched_handlers(node_class: type[Node]) -> list[str]:
 
 
 def further_port(topic_name: str) -> str:
-    """Return the name of the port for a topic that `Node.further_inputs` has returned."""
+    """Return the name of the input port for a topic that is not among a node's declared ports.
+
+    The method `Node.further_inputs` returns these topics.
+    """
     return f"in/{topic_name}"
 
 

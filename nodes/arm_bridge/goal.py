@@ -83,7 +83,7 @@ def extrapolate_goal(
 
 @dataclass(frozen=True, slots=True)
 class GoalTiming:
-    """The time constants for the conversion of a target to a goal.
+    """The time constants for computing the sheet motion at the time when a command takes effect.
 
     servo_lag_s: time from the transmission of a command until it takes effect.
     target_period_s: time from the arrival of a target until the next target is due.
@@ -123,12 +123,15 @@ def make_goal(
     trajectory: SheetTrajectory | None = None,
     planner_ended: bool = False,
 ) -> Goal:
-    """Convert a target to the goal of a command that is sent now.
+    """Compute the goal, the desired sheet motion when a command that is sent now takes effect.
 
+    target: desired sheet motion at an earlier or later time.
     received_ns, now_ns: arrival time of the target, and present time.
-    trajectory: result of `find_trajectory` if the other arm follows the trajectory too. The target
-        is then overdue when the trajectory has ended. If the argument is None, the target is
-        extrapolated with constant velocity.
+    trajectory: motion after the target, from `find_trajectory`. None if the other arm does not
+        follow the same trajectory; the target is then extrapolated with constant velocity.
+
+    With a trajectory, the next target is overdue when the trajectory has ended. Without a
+    trajectory, it is overdue one target period after the arrival of the last target.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s

@@ -185,9 +185,12 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Solve the inverse kinematics for n flange poses (n, 4, 4) through intermediate poses.
+        """Solve the inverse kinematics for n flange poses (n, 4, 4) iteratively.
 
-        joints_rad: joint angles (6,) from which the intermediate poses start.
+        The iteration starts at given joint angles. It follows poses that are interpolated between
+        the flange pose at the start and each goal. It therefore stays near the initial solution.
+
+        joints_rad: joint angles (6,) at the start.
 
         Returns the joint angles (n, 6), rad, and the pose errors (n,), m or rad.
         """

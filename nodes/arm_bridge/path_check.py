@@ -191,13 +191,13 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
 def _check_alignment(
     left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
 ) -> None:
-    """Raise PathError if a straight joint motion of both arms to the path is not permitted.
+    """Check the straight joint motion of both arms to a point on the sheet's path.
 
     begin, there: joint angles of both arms at the start and at the end.
 
-    No joint may move by more than MAX_ALIGN_RAD. No limit of the sheet, of the distance between the
-    flanges, or of the workspace may be violated. A limit that is already violated at the start is
-    widened to slightly more than its value at the start.
+    Raises PathError if a joint moves by more than MAX_ALIGN_RAD. Also raises PathError if the
+    motion violates a limit of the sheet, of the distance between the flanges, or of the workspace.
+    If a limit is already violated at the start, the motion may violate it slightly more.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)

@@ -193,7 +193,10 @@ class EyeViewRequester:
             self._restore_display()
 
     def on_others_display(self, display: Display) -> None:
-        """Store the display settings of another node, which an eye view must restore."""
+        """Store the display settings that another node has published.
+
+        An eye view changes the display settings, and restores these settings when it is finished.
+        """
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
@@ -228,7 +231,10 @@ class EyeViewRequester:
         )
 
     def request_now(self) -> None:
-        """Request the next eye view without waiting for the end of the period."""
+        """Request the next eye view immediately.
+
+        Without this call, eye views are requested at intervals of EYE_VIEW_PERIOD_S.
+        """
         self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:

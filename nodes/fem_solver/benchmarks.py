@@ -122,7 +122,7 @@ class SoftBodyBenchmark:
         return body, model
 
     def coarsest(self) -> SceneBody:
-        """Return the soft body with the coarsest skin mesh, which uses the linear method."""
+        """Return the soft body with the coarsest skin mesh, for the linear method."""
         return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
 
     def sample(self) -> SamplePoint:
@@ -246,7 +246,11 @@ class SoftBodyBenchmark:
 
 
 class ReferenceSet:
-    """The reference solutions of pushes at one point, in order of decreasing accuracy."""
+    """Reference solutions for pushes at one surface point, sorted from most to least accurate.
+
+    The error of a method is its difference from the most accurate solution. The uncertainty is the
+    difference between the two most accurate solutions.
+    """
 
     def __init__(
         self, references: Sequence[ReferenceSolution], sample: SamplePoint, scene: Scene

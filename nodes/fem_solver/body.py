@@ -131,7 +131,11 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, with the stiffness at the front of the object."""
+        """Return the response of the body while the finger does not touch it.
+
+        Displacement and force are zero. Stiffness and force curve belong to the front of the
+        object.
+        """
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -231,9 +235,9 @@ def build_scene_body(
 def attach_table(
     body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table, *, quick: bool = False
 ) -> SceneBody:
-    """Return a copy of the body that uses the nonlinear table as its method.
+    """Return a copy of the body that computes its responses from a precomputed nonlinear table.
 
-    quick: whether the table is the coarse table, which is computed from only a few snapshots.
+    quick: whether the table is the coarse table, which is computed first from only a few pushes.
     """
     method = TableSoftBody(
         model.response,

@@ -102,8 +102,9 @@ class Response:
 class SoftBodyMethod(Protocol):
     """The interface of the methods that compute the response of a soft body to the finger.
 
-    name: name of the method in messages. at_rest (s, 3): displacement of the s skin nodes if the
-    finger does not touch the skin, which is zero.
+    name: name of the method in messages.
+    at_rest (s, 3): zero displacement of the s skin nodes, for a finger that does not touch the
+        skin.
     """
 
     @property

@@ -78,11 +78,13 @@ class SoftBodySpec:
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyModel:
-    """The precomputed elastic response of a soft body and its skin mesh.
+    """The precomputed elastic response of a soft body, and its skin mesh.
 
-    response: response to normal forces. triangles (t, 3): skin triangles with outward normals.
-    bounds (s,): true for each skin node that the finger must not touch; false on end faces. drag:
-    response to tangential forces; None if the finger does not stick to the skin.
+    response: response to normal forces.
+    triangles (t, 3): skin triangles with outward normals.
+    bounds (s,): whether the finger must not touch each skin node, for example because the support
+        fixes the node. Nodes on end faces are not marked.
+    drag: response to tangential forces; None if the finger does not stick to the skin.
     """
 
     response: SkinResponse

@@ -60,10 +60,13 @@ class ReferenceSolution:
         return bool((np.abs(depths - depth_m) < 1e-9).any())
 
     def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
-        """Return the displacement (q, 3), m, of skin points (q, 3), and the normal force (N) for a
-        Young's modulus of 1 Pa.
+        """Return the displacement (q, 3), m, of q skin points, and the normal force on the finger.
 
-        depth_m: push depth, which must be one of the depths of the snapshot.
+        depth_m: push depth; only the depths of the precomputed solution are permitted.
+        points (q, 3): undeformed positions, m.
+
+        The force (N) is valid for a Young's modulus of 1 Pa. It must be multiplied by the true
+        modulus.
         """
         level = int(np.abs(self.snapshot.depths_m - depth_m).argmin())
         nodes, weights = self.locator.weights(points)

@@ -26,7 +26,10 @@ LEVELS = 32767
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path of the file in which the package may contain push solutions for a table."""
+    """Return the path of the file with precomputed push solutions for a table.
+
+    The package contains this file only for some tables.
+    """
     return FOLDER / entry.path(FOLDER).name
 
 

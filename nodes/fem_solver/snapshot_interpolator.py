@@ -80,7 +80,7 @@ def minimal_rotation(start: Floats, end: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class PlacedSnapshot:
-    """A push solution (snapshot) with its surface point and a search structure for its mesh."""
+    """A push solution (snapshot) with the pushed point and a search structure for its mesh."""
 
     sample: SamplePoint
     snapshot: Snapshot

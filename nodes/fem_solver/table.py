@@ -491,9 +491,11 @@ class TableSoftBody:
         return self._curve_at(nodes, weights)
 
     def _curve_at(self, nodes: Ints, weights: Floats) -> Floats:
-        """Return the force curve (n, 2) of a skin point, interpolated between nodes.
+        """Return the force-depth curve (n, 2), m and N, of a skin point.
 
-        The running maximum is used, because negative weights could let the force fall with depth.
+        The curve is interpolated between the mesh nodes. Interpolation weights can be negative, so
+        the interpolated force could decrease with depth. The curve is therefore replaced by its
+        running maximum.
         """
         result = np.empty((len(self._depths), 2))
         result[:, 0] = self._depths

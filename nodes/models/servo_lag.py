@@ -88,15 +88,16 @@ class LagBounds:
 
 @dataclass(frozen=True, slots=True)
 class LagEstimate:
-    """An estimated lag (s) of an arm with its standard deviation (s).
+    """An estimated lag (s) of an arm, and its standard deviation (s).
 
-    tracking_error_rad: standard deviation of measured joint angles minus commanded joint angles
-        delayed by the lag, as the norm over the joints.
+    tracking_error_rad: difference between measured joint angles and commanded joint angles that are
+        delayed by the lag. The value is the standard deviation of each joint, combined as the norm
+        over the joints.
     expected_error_rad: tracking error of a critically damped servo with this lag and motion.
     answer_delay_s: mean time from a command to the measurement.
     command_interval_s: mean interval between commands.
 
-    Both means are weighted by the squared speed, as fast motion contains more information.
+    Both means are weighted by the squared speed, because fast motion determines the lag better.
     """
 
     lag_s: float

@@ -142,11 +142,12 @@ class ObjectCurve:
 
 @dataclass(frozen=True, slots=True)
 class StretchLimits:
-    """The limits of the sheet's stretch, edge force and offset.
+    """The limits of the sheet's stretch, edge force and normal offset.
 
     edge_force_n: maximum force on each clamp.
     bounds: limits of the derivative of the offset with respect to the finger's depth. Within these
-        limits, the control loop with the hand is stable. None means that no hand is considered.
+        limits, the control loop with the user's hand is stable. None means that the hand is
+        ignored.
     """
 
     min_stretch_ratio: float
@@ -170,12 +171,14 @@ class StretchLimits:
 def make_stretch_limits(
     sheet: SheetSpec, model: SheetForceModel, bounds: OffsetBounds | None = None
 ) -> StretchLimits:
-    """Return the stretch limits: the fraction USABLE_FRACTION of the scene's limits.
+    """Compute the limits of stretch and edge force from the limits in the scene.
 
-    bounds: bounds on the slope of the offset that keep the control loop of sheet and hand stable.
+    They are a fraction USABLE_FRACTION of the scene's limits. The maximum stretch also keeps the
+    edge force within its limit while nothing touches the sheet. A push increases the edge force
+    further. The function `render_force` limits this increase.
 
-    The maximum stretch keeps the edge force within its limit while nothing touches the sheet.
-    `render_force` limits the additional edge force of a push.
+    bounds: stable range of the derivative of the sheet's normal offset with respect to the finger's
+        depth; None if the user's hand is ignored.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -198,10 +201,14 @@ def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RenderedForce:
-    """The deflections and forces of the sheet at n depths, for one stretch and one position.
+    """The deflections and forces of the sheet at n finger depths.
 
-    indentation_m: deflection of the sheet under the finger, which corresponds to an indentation of
-        the object.
+    They are valid for one stretch of the sheet and one position of the push.
+
+    depths_m: depth of the finger below the undeformed surface of the object.
+    object_force_n, force_n: force of the virtual object, and force of the sheet on the finger.
+    indentation_m: deflection of the sheet under the finger. It is the depth minus the sheet's
+        normal offset.
     edge_force_n: force on each clamp.
     advance_per_depth: maximum advance of the sheet towards the finger, divided by the depth.
     force_limited: whether the limit of the edge force has reduced the indentation.
@@ -578,12 +585,10 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 
 
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, str]:
-    """Return the stretch that renders an object's stiffness at small pushes without an offset.
+    """Return the stretch at which the sheet's stiffness at small deflections matches the object's.
 
-    The second result is a text about a stiffness that the sheet cannot render. It is empty if the
-    sheet can render the stiffness.
-
-    The sheet is modelled as linear, and the fingertip as a point.
+    The second result is a note. It is empty unless the object is softer or stiffer than the sheet
+    can be. The sheet is modelled as linear, and the fingertip as a point.
     """
     least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(

@@ -1,4 +1,4 @@
-"""Detect oscillations of the finger that the sheet's motion drives, and stop this motion."""
+"""Detect finger oscillations that the moving sheet causes, and stop the motion of the sheet."""
 
 from __future__ import annotations
 
@@ -104,10 +104,12 @@ class OscillationWatchdog:
 
 
 def _oscillates(depths: np.ndarray) -> bool:
-    """Return whether n depths (n,), m, change their sign at least twice.
+    """Return whether the deviation of the finger's depth from its slow mean oscillates.
 
-    The depths of a single push change their sign less often. Values smaller than MIN_AMPLITUDE_M
-    are ignored.
+    depths: n deviations (n,), m.
+
+    An oscillation changes its sign at least twice. A single push changes its sign less often.
+    Values smaller than MIN_AMPLITUDE_M are ignored.
     """
     large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
     return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

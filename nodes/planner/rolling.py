@@ -77,12 +77,12 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 
 
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
-    """Return the contact after the sheet has rolled to the surface point `found`.
+    """Return the contact after the sheet has rolled without slip to the surface point `found`.
 
-    The displacement of the contact on the sheet follows from the chord between both points. The
-    chord is projected onto the plane halfway between the tangent planes, and scaled to the length
-    of the arc. The displacement is exact on circles. On other curves, the error is of third order
-    in the angle.
+    The distance on the sheet is the length of a circular arc through both points. Its direction is
+    the direction of the chord, projected onto the plane halfway between the tangent planes. The
+    result is exact on circles. On other curves, the error is of third order in the angle between
+    the normals.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
@@ -115,12 +115,13 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 
 
 def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
-    """Return the twist (6,) of the rolling sheet's centre for a given velocity of the contact.
+    """Return the twist (6,) of the sheet's centre while the sheet rolls on the object without slip.
 
-    rate: velocity (3,) m/s of the contact on the object.
+    rate: velocity (3,) m/s at which the contact point moves on the object.
 
     The twist consists of linear velocity (m/s) and angular velocity (rad/s). The angular velocity
-    is n x dn/dt with the surface normal n. The point of the sheet in contact is at rest.
+    is n x dn/dt with the surface normal n. The material point of the sheet at the contact is at
+    rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)

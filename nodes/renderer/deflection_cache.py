@@ -50,7 +50,11 @@ Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return a scene's rubber, and the ranges of stretch and depth of its deflection shapes."""
+    """Return the rubber of a scene's sheet, and the range of pushes that the scene requires.
+
+    The range contains stretch ratios and depths. For this range, the deflections of the pushed
+    sheet are precomputed.
+    """
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(

@@ -96,10 +96,13 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame, and return its message and the camera exposure time (ns) of its input data.
+        """Draw a frame. Return its message, and the exposure time of the camera images behind it.
 
-        begun_ns: start of drawing. with_pixels: whether the message contains the image. If there is
-        a window, `on_shown` later adds the display time to the message.
+        begun_ns: start of drawing.
+        with_pixels: whether the message contains the image.
+
+        The exposure time is a timestamp (ns). If there is a window, the method `on_shown` later
+        adds the display time to the message.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         self._drawn_of = (ports.skin.message, ports.eye.message, shown)

@@ -258,14 +258,16 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image. Return an array (height, width, 3) if `read` is true,
-        otherwise None.
+        """Draw the projector's image. If `read` is true, return an array (height, width, 3).
 
-        eyes (1 or 2, 3): positions of the eyes, world frame, m. If `eyes` is None, the eyes of the
-        scene are used. If there are two eyes, they share one image. In the mode frame_sequential,
-        there are two images instead, and the image of the left eye is returned. drawn: function
-        that receives the index of each image as soon as the image is in `canvas.resolved`. Raises
-        ValueError if the sheet's pose is not finite.
+        eyes (1 or 2, 3): positions of the eyes, world frame, m; None means the eyes in the scene.
+        drawn: function that is called when an image is finished in the buffer `canvas.resolved`.
+            Its argument is the index of the image.
+
+        Two eyes share one image, except in the mode frame_sequential. In this mode, each eye has an
+        image, and the image of the left eye is returned.
+
+        Raises ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")
@@ -383,10 +385,11 @@ class SceneRenderer:
         return image
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
-        """Compute the mesh of the sheet by the method `sheet_shape`.
+        """Compute the mesh of the sheet by the method that the attribute `sheet_shape` selects.
 
-        If there are no deflection shapes, a mesh of four triangles replaces the method
-        reduced_order. The attribute `note` states why the mesh is inaccurate, or is empty.
+        If the deflection shapes for the method reduced_order are not precomputed, the mesh is a
+        pyramid of four triangles. The attribute `note` states why the mesh is inaccurate, or is
+        empty.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
             if self.sheet_shape == "reduced_order":

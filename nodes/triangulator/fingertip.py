@@ -110,12 +110,12 @@ class BlobPair:
     """A pair of blobs in the left and the right image that may show the same marker.
 
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
-    gate_fraction: distance from the gate's centre divided by the gate's radius; 0 if there is no
-        gate.
-    cost: sum of the squared deviations of rays, radii, heights and distance from the gate's centre,
-        each divided by its variance.
+    gate_fraction: distance from the predicted position, divided by the radius of the search region
+        (gate); 0 if there is no prediction.
+    cost: measure of the mismatch between both blobs, and of the distance from the predicted
+        position. It is a sum of squared differences, each divided by its variance.
     rejection_reason: reason why the pair cannot be a marker in the finger's working volume; None if
-        it can be one.
+        the pair is acceptable.
     """
 
     left: Blob
@@ -151,7 +151,8 @@ class StereoDetection:
     reason: "ok", or the reason why the finger was not found.
     measured: triangulated point of the finger's marker or of a rejected marker; None if no point
         was triangulated.
-    markers: candidates inside the gate, sorted by cost.
+    markers: candidates inside the gate, the region around the predicted position of the finger's
+        marker. They are sorted by cost.
     clutter: candidates outside the gate.
     """
 
@@ -338,11 +339,11 @@ def _match_blobs(
 
 @dataclass(frozen=True, slots=True)
 class RefinedPair:
-    """A pair of blobs, and its left and right marker after the refinement to subpixel accuracy.
+    """A pair of blobs, with the left and the right marker that are located to subpixel accuracy.
 
-    rejection_reason: reason why the pair cannot be the marker; None if the marker is valid.
-    cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
-        standard deviations.
+    rejection_reason: reason why the pair cannot be the finger's marker; None if it can.
+    cost: cost of the blob pair, plus the squared deviations of the radii from their expected
+        values, each divided by its variance.
     measured: triangulated marker; None if the pair cannot be the marker, or if the rays through the
         centres do not meet.
     """
@@ -419,8 +420,9 @@ def _check_flat_pair(
     """Check whether two ellipses show one flat marker, and correct their centres for perspective.
 
     Returns both markers with corrected centres, and with the major semi-axis as radius. Returns
-    None if the ellipses do not show one flat marker. The mismatch of the shapes is added to the
-    covariance, because an obstacle in front of a marker shifts its centre by a similar amount.
+    None if the ellipses do not show one flat marker. The measured shapes differ from the ideal
+    ellipses, for example if an obstacle covers part of the marker. This difference is added to the
+    covariance of the centres.
     """
     measured = _triangulate(inputs, markers)
     if measured is None:

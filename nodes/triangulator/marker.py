@@ -74,9 +74,10 @@ class Blob:
     """A bright blob that may be a marker. Lengths are in pixels of the searched image.
 
     centre: centroid of the blob's light.
-    radius: radius of the disc that has the same area as the blob's pixels above half its `height`.
+    radius: radius of the disc with the same area as the pixels that are brighter than the mean of
+        `peak` and `surround`.
     motion: displacement (x, y) during the exposure, estimated from the second moments of the light.
-    spread: smallest second moment of the light, divided by the second moment of a uniform disc with
+    spread: second moment of the light in its narrowest direction, relative to a uniform disc of
         this radius.
     peak, surround: grey levels of the brightest pixel and of the surroundings.
     window: part of the image that contains the blob and its surroundings.

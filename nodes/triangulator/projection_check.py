@@ -100,8 +100,8 @@ class ProjectionCheck:
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
         """Compare bright points (3,), m, with the expected positions of the projected check marks.
 
-        camera_shift_m: displacement (3,) by which an error of the camera's pose shifts the measured
-            positions of the fixed reference marks.
+        camera_shift_m: measured displacement (3,) of the fixed reference marks, caused by an error
+            of the camera's pose. It is subtracted from the displacement of the check marks.
         at_ns: time of the image pair that shows the points.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]

@@ -242,8 +242,8 @@ class DiscSolution:
     residuals: differences (n, s * s) between image and model before the last step.
     weights: inverse noise variances (n, s * s) of the pixels; zero for excluded pixels.
     information: Fisher information plus prior (n, parameters, parameters).
-    gains: first-order reduction (n, parameters) of the weighted squared residuals by the last step
-        of each parameter.
+    gains: decrease (n, parameters) of the weighted squared residuals in the last step, to first
+        order. It is the contribution of each parameter.
     converged: whether each disc (n,) has converged.
     """
 

@@ -300,9 +300,10 @@ class Tracker:
     def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
         """Insert a late point into the history, and filter all later points again.
 
-        If several consecutive points are late, they restart the track, because the clock was
-        probably set back. A single late point is dropped if no point is missing at its time, or if
-        a finger cannot move through this point.
+        A late point is older than the newest point of the track. It is inserted only if the history
+        has a gap at its time, and if a finger can move through this point. Otherwise, it is
+        dropped. If several consecutive points are late, the clock was probably set back, and the
+        track restarts with these points.
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:

@@ -189,9 +189,11 @@ class TwinEyeNode(Node):
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
         """Return the true world position (3,), m, of the simulated eye at the time `at_s`.
 
-        The viewpoint is one of the tracked eyes, or their midpoint. If no eyes are tracked, the
-        eyes of the true scene are used. The offset of tracked eyes in the parameter `apparatus`
-        (true hardware parameters) and the simulated head motion are added.
+        viewpoint: left eye, right eye, or the midpoint of both.
+
+        The position is the tracked position of the eyes plus the tracking error in the parameter
+        `apparatus`. If no eyes are tracked, it is the position in the true scene. The simulated
+        head motion is added.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

@@ -228,7 +228,11 @@ def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _arc_run(scene: Scene) -> tuple[float, float]:
-    """Return half the arc length (m) and the speed (m/s) of a stroke of the finger."""
+    """Return the amplitude (m) and the speed (m/s) of a stroke of the finger around the object.
+
+    The amplitude is half of the touchable length, which the front of the object divides into two
+    halves.
+    """
     half = 0.5 * touchable(scene)[1]
     return half, min(scene.working_range.speed_m_per_s, half / 0.3)
 

@@ -327,8 +327,8 @@ class MxtServer:
     ) -> None:
         """Store the settings. The method `start` opens the port.
 
-        before: function that is called before each packet and cycle. It must call
-            `controller.advance`.
+        before: function that is called before each packet is processed and before each cycle. It
+            must call `controller.advance` to advance the simulated controller to the present time.
         """
         self.controller = controller
         self._address = (host, port)

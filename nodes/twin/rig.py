@@ -90,7 +90,7 @@ def make_true_camera(camera: StereoCamera) -> StereoCamera:
 
 
 def pixels_of(lens: Lens, slopes: Floats) -> Floats:
-    """Project rays to pixels (..., 2) of a lens with Brown's distortion.
+    """Return the pixels (..., 2) at which a lens with Brown's distortion images rays.
 
     slopes (..., 2): x/z and y/z of the rays.
     """

@@ -178,7 +178,10 @@ def _fan(rim: Indices, centre: int) -> Indices:
 
 
 def _turned() -> Floats:
-    """Return unit vectors (AROUND, 3) perpendicular to the x axis, from +z towards +y."""
+    """Return AROUND unit vectors (AROUND, 3) at equal angles around the x axis.
+
+    The first vector is +z. The angle increases towards +y.
+    """
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     return np.column_stack([np.zeros(AROUND), np.sin(angle), np.cos(angle)])
 

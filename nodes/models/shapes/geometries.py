@@ -1,8 +1,8 @@
 """Describe each kind of geometry in one table, `GEOMETRIES`.
 
-The functions in a description receive an object whose attributes are the dimensions of the
-geometry. Examples are `scene.object.geometry` and the shape itself. A new kind of geometry needs a
-shape class and a description in the table.
+A description contains functions that compute properties from the dimensions of a geometry. They
+read the dimensions as attributes, either of the geometry in a scene or of a shape. To add a new
+kind of geometry, define a shape class and add a description to the table.
 """
 
 from __future__ import annotations

@@ -263,8 +263,8 @@ class RoundedBoxShape(Convex):
     size_m: full extents along x, y and z, including the rounding.
     edge_radius_m: radius of edges and corners, at most half of the smallest extent.
 
-    The normal is continuous along the surface, but the curvature is not. The core is the box that
-    contains the centres of curvature of all edges and corners.
+    The shape contains all points within `edge_radius_m` of a smaller box, which is called the core.
+    The normal is continuous along the surface, but the curvature is not.
     """
 
     size_m: tuple[float, float, float]
@@ -326,14 +326,16 @@ class RoundedBoxShape(Convex):
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Return the face of the core that is nearest to each query (n, 3) inside the core.
+        """Return the nearest face of the core (inner box) for each query (n, 3) inside the core.
 
-        before: previous nearest points (n, 3), or None if there are none. Only faces that contain
-            these points are considered. If there are none and several faces are equally near, the
-            first face in the order z, y, x, -z, -y, -x is chosen.
+        before: previous nearest points (n, 3) on the rounded box; None if there are none. Only the
+            faces next to a previous point are considered.
 
-        Return four arrays (n,): axis and sign of the face's normal, distance from the face, m, and
-        whether the choice is ambiguous.
+        If several faces are equally near, the first face in the order z, y, x, -z, -y, -x is
+        chosen.
+
+        Returns four arrays (n,): axis of the face's normal, sign of the normal, distance from the
+        face (m), and whether several faces are equally near.
         """
         core = self._core()
         # Columns z, y, x, -z, -y, -x.

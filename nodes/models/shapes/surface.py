@@ -76,10 +76,8 @@ class Shape(Protocol):
         """Find the touchable surface points that are nearest to `points`.
 
         previous: nearest points of the previous queries, with the shape of `points`; None if the
-            contact is new. If previous points are given, the results are continuous over time. The
-            search then returns the local minimum of the distance that continues the previous point,
-            as long as this minimum exists. Another surface point can be equally near. Inside the
-            object, another point can even be nearer.
+            contact is new. The search then follows each point continuously, even if another surface
+            point is equally near. Inside the object, another point can even be nearer.
 
         Raises ValueError if a coordinate is not finite or exceeds `MAX_QUERY_M`, or if the shape of
         the array is neither (3,) nor (n, 3).

@@ -62,7 +62,7 @@ class SheetForce:
 
 
 class SheetForceModel(Protocol):
-    """The interface of models of the force on a sheet that a fingertip pushes."""
+    """The interface of models that compute the force of the sheet on a fingertip that pushes it."""
 
     @property
     def name(self) -> str: ...
