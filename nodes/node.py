@@ -267,7 +267,7 @@ def find_unmatched_handlers(node_class: type[Node]) -> list[str]:
 
 
 def further_port(topic_name: str) -> str:
-    """Return the name of the input port for a topic that is not among a node's declared ports.
+    """Return the name of the input port for a topic without a declared port.
 
     The method `Node.further_inputs` returns these topics.
     """

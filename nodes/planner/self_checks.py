@@ -91,8 +91,8 @@ class MeasuredForceCheck:
     def add_push(self, push: PlannedPush) -> None:
         """Store a planned push, and compare measured forces with the forces of the sheet model.
 
-        A force is compared only when the planned pushes until QUIET_S after its measurement are
-        known.
+        A force is compared when all pushes within QUIET_S of its measurement are known. It is
+        ignored if the depth changes during this time.
         """
         self._pushes.append(push)
         limit_ns = push.valid_at_ns - round(1e9 * QUIET_S)

@@ -317,7 +317,7 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 def _require_fixed_back(spec: MeshSpec, fixed: Bools, normals: Floats) -> None:
     """Raise UnfitMeshError unless the whole back of the slab that represents a half-space is fixed.
 
-    A slab that is fixed in a part of its back only bends, and is far softer than a half-space.
+    A slab with a partly fixed back bends, and is therefore far softer than a half-space.
     """
     back = normals[:, 2] < 0.0
     if not fixed[back].all():

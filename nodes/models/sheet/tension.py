@@ -102,7 +102,7 @@ def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
 
 
 def edge_force_for_stiffness(stiffness_n_per_m: float, *, width_m: float) -> float:
-    """Return the edge force (N) that gives the sheet's centre a stiffness at small deflections."""
+    """Return the edge force (N) for a required stiffness at small deflections of the centre."""
     return stiffness_n_per_m * width_m / PUSH_FACTOR
 
 
