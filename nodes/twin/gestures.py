@@ -6,9 +6,10 @@ The gestures follow published measurements of human motion:
     (Atkeson and Hollerbach 1985, J. Neurosci. 5:2318). It is the profile of minimum jerk (Flash and
     Hogan 1985, J. Neurosci. 5:1688). Its peak speed is 1.875 times the mean speed. Its maximum
     acceleration is 5.77 distance / duration^2.
-- Unhurried reaches have peak speeds of 0.2-0.35 m/s (REACH+). Hurried elbow flexions of 27-45
-    degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341). The deceleration
-    takes half of this time, 50-80 ms.
+- The peak speed of unhurried reaches is assumed to be 0.2-0.35 m/s. Encountered-type displays were
+    tested at these robot speeds (Gonzalez, Abtahi and Follmer 2020, REACH+).
+- Hurried elbow flexions of 27-45 degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav.
+    14:341). The deceleration takes half of this time, 50-80 ms.
 - People explore a surface at 77-86 mm/s on average (Smith, Gosselin and Houde 2002, Exp. Brain Res.
     147:209).
 - In typing, the interval between taps is 150-500 ms (Angelaki and Soechting 1993, Exp. Brain Res.
@@ -16,7 +17,7 @@ The gestures follow published measurements of human motion:
     (finger tapping test of the Halstead Reitan battery). The contact is assumed to last 100-200 ms
     of an unhurried tap, and about half of a hurried tap. There is no source for soft objects.
 - After a signal to stop a reach, people need 206 ms on average to react (Mirabella, Pani, Pare and
-    Ferraina 2006, Exp. Brain Res. 174:240). Therefore a stop is sudden only for an observer.
+    Ferraina 2006, Exp. Brain Res. 174:240).
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
     motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
 - Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411). Its amplitude is

@@ -418,7 +418,7 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return a random generator for one parameter, independent of those of other parameters."""
+    """Return a random generator for one parameter, which does not depend on other parameters."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 
