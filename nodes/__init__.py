@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 
 
 class NodeRole(StrEnum):
-    """The role of a node in the graph, by which launcher, `flexsheet doctor` and replay select it.
+    """The role of a node in the graph.
 
-    A node class declares its role as the attribute `role`. A class that publishes ArmState is an
-    arm bridge by default.
+    The launcher, `flexsheet doctor` and the replay of bags use the role to find nodes, for example
+    the recorder. A node class declares its role as the attribute `role`. A class that publishes
+    ArmState is an arm bridge by default.
     """
 
     ARM_BRIDGE = "arm_bridge"
@@ -128,7 +129,7 @@ def node_class(name: str) -> type[Node]:
 
 
 def _describe_import_error(module: str, error: BaseException) -> tuple[str, str]:
-    """Return the location and the text of an error during an import, and an advice."""
+    """Return the text of an error during an import, and an instruction to correct the error."""
     missing = error.name if isinstance(error, ModuleNotFoundError) else None
     if missing and (module == missing or module.startswith(f"{missing}.")):
         return str(error), (
@@ -145,7 +146,7 @@ def _describe_import_error(module: str, error: BaseException) -> tuple[str, str]
 def _locate_error(module: str, error: BaseException) -> str:
     """Return "file:line" of an error during the import of a module, or the name of the module.
 
-    If a library raises the error, this is the line that calls the library.
+    If a library raises the error, the result is the line of the module that calls the library.
     """
     import traceback  # imported here, because it is slow and only needed after an error
     from sysconfig import get_paths

@@ -1,4 +1,7 @@
-"""Define names of array types. The docstrings that use them state shapes and units."""
+"""Define short names for NumPy array types by element type.
+
+The names do not include shapes and units. The docstrings of functions and classes state these.
+"""
 
 from __future__ import annotations
 

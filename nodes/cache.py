@@ -43,9 +43,9 @@ def default_cache_dir() -> Path:
 
 
 def advise_precompute(scene: Scene, options: str = "") -> str:
-    """Return the advice to compute the missing tables of a scene, for the note of a node.
+    """Return a text that tells the user how to compute the missing tables of a scene.
 
-    options: options of the command, which start with a space.
+    options: further options of the command, which begin with a space.
     """
     command = f"flexsheet precompute SCENE{options}"
     return f'with the file of the scene "{scene.name}" as SCENE, run {command}'
@@ -82,7 +82,7 @@ class Specification(Generic[T]):
         ) / f"{self.kind}-{make_digest(self.depends_on)}.npz"
 
     def checkpoints(self, cache_dir: Path | None) -> CheckpointStore:
-        """Return the store for checkpoints of the computation of this result.
+        """Return the store in which an interrupted computation saves its intermediate results.
 
         cache_dir: folder of the cache; None means the cache of the user.
         """
@@ -130,14 +130,14 @@ def save_cached(specification: Specification[T], cache_dir: Path | None, result:
 
 
 def encode_fields(result: Any) -> dict[str, NDArray[Any]]:
-    """Return the array fields of a dataclass instance, by name."""
+    """Return the array fields of a dataclass instance as a dict with the field names as keys."""
     return {one.name: np.asarray(getattr(result, one.name)) for one in fields(result)}
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Return the arrays of a file by name, or None if the file does not exist or is damaged.
+    """Return the arrays of a file as a dict with their names as keys.
 
-    A damaged file is logged.
+    Returns None if the file does not exist or is damaged. A damaged file is logged.
     """
     try:
         # Reading a member of the archive to its end verifies its CRC-32.

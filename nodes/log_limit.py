@@ -33,7 +33,7 @@ class Repeats:
 
 
 class RepeatLimiter:
-    """A structlog processor that passes only the 1st, 10th, 100th, ... of equal log records.
+    """A structlog processor that passes only the 1st, 10th, 100th and so on of equal log records.
 
     In addition, one repeated record passes every REPORT_PERIOD_S seconds. Records that differ only
     in numbers count as equal. In each repeated record that passes, `count` is the number of

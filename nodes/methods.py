@@ -122,12 +122,17 @@ class Family:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """The measured time and error of one method in one benchmark case. The class `Trial` describes
-    further fields.
+    """The measured time and error of one method in one benchmark case.
 
     params: case and size of the solved problem.
-    median_range_s, error_range: limits of the 95 % confidence intervals; None if the value is exact
-        or its spread was not measured.
+    median_s, p99_s: median and 99th percentile of the time.
+    in_range: whether the method's valid range includes the case.
+    in_scene: whether the scene's working range includes the case.
+    extra_metrics: further results, with units in their names.
+    reference_uncertainty: uncertainties of the reference. The keys are "error" and the names of
+        extra metrics.
+    median_range_s, error_range: limits of the 95 % confidence intervals. None means that the value
+        is exact, or that its random variation was not measured.
     """
 
     method: str
@@ -182,7 +187,10 @@ def measure(trial: Trial, *, repeats: int) -> Point:
 
 
 def clip_range(end: float, values: Sequence[float]) -> tuple[float, ...]:
-    """Return the values that are below the end of a working range, followed by the end itself."""
+    """Return the values that are less than `end`, followed by `end`.
+
+    The function limits the cases of a benchmark to the scene's working range.
+    """
     return (*(value for value in values if value < end * (1.0 - 1e-6)), end)
 
 

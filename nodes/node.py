@@ -124,9 +124,10 @@ class ExecutionLog:
         self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
 
     def drain(self) -> NDArray[np.int64]:
-        """Return the n rows (n, 4) of the log.
+        """Return the logged handler calls as an array (n, 4), and delete them from the log.
 
-        If RESEND_NS has passed since the start, the rows are deleted from the log.
+        In the first RESEND_NS nanoseconds after the node's start, the log is not deleted. Therefore
+        recorders that start late also receive the first calls.
         """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
         if self._clock.now_ns() > self._started_ns + RESEND_NS:
@@ -266,7 +267,10 @@ def find_unmatched_handlers(node_class: type[Node]) -> list[str]:
 
 
 def further_port(topic_name: str) -> str:
-    """Return the name of the port for a topic that `Node.further_inputs` has returned."""
+    """Return the name of the input port for a topic without a declared port.
+
+    The method `Node.further_inputs` returns these topics.
+    """
     return f"in/{topic_name}"
 
 
@@ -360,8 +364,7 @@ class Node:
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
         """Return the names of the topics that the node reads in addition to its declared ports.
 
-        written: topics that the nodes of the graph write. The function `further_port` names the
-            ports of the returned topics.
+        written: topics that the nodes of the graph write, from which the node can choose.
         """
         return ()
 

@@ -50,9 +50,10 @@ ParameterKey = tuple[str | int, ...]
 
 
 def find_marked(parameters: BaseModel, mark: ParameterMark) -> dict[ParameterKey, Any]:
-    """Return the values of all parameters with a mark, by key. Values that are None are omitted.
+    """Return the values of all node parameters that are annotated with a `ParameterMark`.
 
-    Parameters in nested models, unions and sequences are included.
+    The keys are the paths of the parameters. Parameters in nested models, unions and sequences are
+    included. Values that are None are omitted.
     """
     return {key: value for key, value in _search_fields(parameters, (), mark) if value is not None}
 

@@ -185,9 +185,10 @@ class NodeTransport:
         self._stop_socket.open()
 
     def _end_input(self, node: Node, port: str) -> None:
-        """Record that the writer of a watched input has ended.
+        """Record that the writer of an input port has ended.
 
-        If the node has `ends_with_inputs`, disconnect the readers of its outputs, too.
+        If the attribute `ends_with_inputs` of the node is true, disconnect the readers of its
+        outputs. The readers then detect that the data have stopped.
         """
         node.inputs[port].has_ended = True
         if not node.ends_with_inputs or self._has_failed.is_set():
@@ -457,9 +458,10 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
 
 
 def _prioritize(config: ProcessConfig) -> None:
-    """Give this process the configured real-time priority when all nodes are ready.
+    """Give this process the configured real-time priority.
 
-    Before that, the priority would let the start of the process delay other programs.
+    The function is called when all nodes are ready. During the start, a real-time process would
+    delay other programs.
     """
     if config.realtime_priority is not None:
         asyncio.get_running_loop().set_default_executor(

@@ -14,12 +14,12 @@ def handle_signals(
 ) -> Iterator[None]:
     """Call `handler` in the running event loop for each of the given signals.
 
-    ignore_afterwards: whether to ignore the signals after the context instead of restoring their
-        former actions. True is intended for a process that ends after its clean-up.
+    ignore_afterwards: whether the signals are ignored after the context exits. Otherwise the
+        previous signal handlers are restored. True is intended for a process that ends after its
+        clean-up.
 
-    The handler is active until the context exits. When the event loop removes its handler of
-    SIGINT, it installs Python's default, which raises an exception. Therefore the signals are
-    blocked until the former actions are restored.
+    The handler is active until the context exits. The signals are blocked during the change back,
+    because asyncio temporarily installs a handler that raises KeyboardInterrupt.
     """
     loop = asyncio.get_running_loop()
     former = {number: signal.getsignal(number) for number in numbers}

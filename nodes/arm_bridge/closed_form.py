@@ -82,14 +82,15 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 
 
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
-    """Return the angle (rad) by which an axis rotates to become parallel to a vector.
+    """Return the angle (rad) by which a joint rotates to make an axis parallel to a vector.
+
+    Near a singularity, the vector is short. The axis may then deviate from the vector, so that the
+    joint does not rotate fast. The joint rotates by at most MAX_FREE_ROTATION_RAD more than
+    necessary.
 
     along, across: components of the vector parallel and perpendicular to the axis.
-    fixed: length of the vector at which the angle between axis and vector may be 90 degrees.
-    near: length of the vector at which this angle must be 0.
-
-    The vector is short near a singularity. The axis may then deviate from the vector, and rotates
-    by at most MAX_FREE_ROTATION_RAD more than necessary.
+    fixed: length of the vector up to which the axis may even be perpendicular to the vector.
+    near: length of the vector from which the axis must be parallel to the vector.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -188,7 +189,10 @@ class ClosedFormKinematics:
         return np.array(rows).T
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[Branch]:
-        """Return all eight branches. They are the same for each flange pose."""
+        """Return the eight branches (discrete solutions) of the inverse kinematics.
+
+        base_from_flange: not used, because all flange poses have the same branches.
+        """
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
@@ -269,11 +273,14 @@ class ClosedFormKinematics:
     def solve_next_joints(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
         """Return the joint angles (6,) rad for the next step of a motion to a flange pose (4, 4).
 
-        Near J5 = 0, a small motion of the flange would require a fast rotation of J4. J4 may
-        therefore lag. The resulting pose error is at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
-        J1 may lag too if the wrist centre is near the J1 axis. If the solution exceeds the joint
-        ranges, another branch is selected. Raises UnreachableError if no branch is within the joint
-        ranges.
+        present_rad: present joint angles (6,).
+
+        Near the wrist singularity (J5 = 0), a small motion of the flange would require a fast
+        rotation of J4. There, the angle of J4 may deviate from the inverse kinematics. The
+        resulting orientation error is at most 1.05 degrees. Near the shoulder singularity, the
+        angle of J1 may deviate, and the position error is at most 1 mm. If the solution exceeds the
+        joint ranges, another branch (discrete solution) is selected. Raises UnreachableError if no
+        branch is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -375,7 +382,7 @@ class ClosedFormKinematics:
         return found
 
     def find_branch(self, joints_rad: ArrayLike) -> Branch:
-        """Return the branch to which joint angles (6,) rad belong.
+        """Return the branch (discrete inverse-kinematics solution) of the joint angles (6,) rad.
 
         At a singularity, several branches match, and the first of them is returned.
         """
@@ -391,6 +398,7 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
+        branch: one of the discrete solutions of the inverse kinematics.
         near_rad: joint angles (6,) that select among angles which differ by whole revolutions.
 
         The angles may exceed the joint ranges. They are NaN if a pose is out of reach.

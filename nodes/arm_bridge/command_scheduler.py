@@ -1,4 +1,8 @@
-"""Schedule the commands to an arm: one for each target, and periodic ones between targets."""
+"""Schedule the commands to an arm.
+
+A command is sent when a target of the sheet arrives. Between targets, commands are sent
+periodically.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,9 @@ from dataclasses import dataclass
 class CommandScheduler:
     """A scheduler for the commands to one arm.
 
-    period_s: time between periodic commands.
-    target_period_s: time between targets.
+    period_s: time between periodic commands, which are sent even if no new target of the sheet
+        arrives.
+    target_period_s: time between targets of the sheet from the planner.
     idle_period_s: time between commands to an idle arm.
 
     In all methods, `sent_ns` is the time of the last command, or 0 before the first command.

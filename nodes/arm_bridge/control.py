@@ -199,7 +199,11 @@ class ArmControl:
 
     @property
     def mode(self) -> ArmMode:
-        """Return the arm's mode that the bridge publishes for the present state."""
+        """Return the arm's mode for ArmState messages.
+
+        An arm in the state TAUT has the mode "fault" if it has faults. Otherwise, `MODES` contains
+        the mode for each state of the state machine.
+        """
         return "fault" if self._state is State.TAUT and self.faults else MODES[self._state]
 
     @property
@@ -491,7 +495,10 @@ class ArmControl:
         return self._move_to_target(goal, other, measured)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
-        """Return why the arm must stop without slackening the sheet, or None if it need not."""
+        """Return why the arm must stop without a motion that slackens the sheet.
+
+        Returns None if there is no reason for such a stop.
+        """
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if other is not None and other.estopped:
@@ -610,10 +617,10 @@ class ArmControl:
         return self._decelerate(reason)
 
     def on_path_result(self, request: PathCheckRequest, result: Alignment | str | None) -> None:
-        """Store the result of a path check, unless another request is pending.
+        """Store the result of a path check. A result for an outdated request is ignored.
 
-        result: alignment to the start of the path, None if no alignment is necessary, or the reason
-            why the path is blocked.
+        result: straight joint motion (alignment) from the present pose to the start of the path;
+            None if none is necessary. If the path is blocked, the result is the reason.
         """
         if request is not self.pending_check:
             return
@@ -636,9 +643,9 @@ class ArmControl:
         return self._send("move", self.commanded_rad)
 
     def _align(self, alignment: Alignment, other: OtherArm) -> Command:
-        """Return the command for the next step of the alignment to the path.
+        """Return the next command of the joint motion to the start of the sheet's path.
 
-        The alignment pauses while a message is late, or while the other arm is not ready.
+        The motion pauses while a message is late, or while the other arm is not ready.
         """
         if self._state is State.FOLLOW and self._together:
             self._aligned_s += self._step_s

@@ -205,10 +205,12 @@ class ArmGeometry:
     def check_limits(
         self, flange: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
     ) -> str | None:
-        """Describe the limit that the flanges or the sheet violate; return None if there is none.
+        """Describe the limit that the flanges or the sheet violate.
 
         flange, other_flange: world poses (4, 4) of this arm's flange and of the other flange.
         slack_m: tolerance on the limits of the flange.
+
+        Returns None if no limit is violated.
         """
         return check_flange(flange, other_flange, limits, slack_m=slack_m) or check_sheet(
             flange @ self.flange_from_edge,

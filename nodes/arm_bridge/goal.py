@@ -68,11 +68,13 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the motion of a target by `ahead_s`.
+    """Return the goal that results from extrapolating the motion of a target by `ahead_s`.
 
-    overdue_s: time since the next target was due. This time is increased if the extrapolation is
-        limited, or if the target is too far in the future.
+    overdue_s: time since the next target was due.
     max_extrapolation_s: maximum of the absolute extrapolation time.
+
+    If `ahead_s` exceeds this maximum, or if the target's timestamp is too far in the future,
+    `Goal.overdue_s` is increased. The arm then stops as it does when targets are overdue.
     """
     carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
     late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)
@@ -81,7 +83,7 @@ def extrapolate_goal(
 
 @dataclass(frozen=True, slots=True)
 class GoalTiming:
-    """The time constants for the conversion of a target to a goal.
+    """The time constants for computing the sheet motion at the time when a command takes effect.
 
     servo_lag_s: time from the transmission of a command until it takes effect.
     target_period_s: time from the arrival of a target until the next target is due.
@@ -121,12 +123,15 @@ def make_goal(
     trajectory: SheetTrajectory | None = None,
     planner_ended: bool = False,
 ) -> Goal:
-    """Convert a target to the goal of a command that is sent now.
+    """Compute the goal, the desired sheet motion when a command that is sent now takes effect.
 
+    target: desired sheet motion at an earlier or later time.
     received_ns, now_ns: arrival time of the target, and present time.
-    trajectory: result of `find_trajectory` if the other arm follows the trajectory too. The target
-        is then overdue when the trajectory has ended. If the argument is None, the target is
-        extrapolated with constant velocity.
+    trajectory: motion after the target, from `find_trajectory`. None if the other arm does not
+        follow the same trajectory; the target is then extrapolated with constant velocity.
+
+    With a trajectory, the next target is overdue when the trajectory has ended. Without a
+    trajectory, it is overdue one target period after the arrival of the last target.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s

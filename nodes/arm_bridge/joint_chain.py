@@ -74,7 +74,11 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class SeedBranch(NamedTuple):
-    """A branch of an arm without closed-form kinematics, defined by one set of joint angles."""
+    """A branch of the inverse kinematics, represented by joint angles on this branch.
+
+    A branch is one of the discrete solutions for a flange pose. This class is used for arms without
+    closed-form kinematics.
+    """
 
     seed_rad: tuple[float, ...]
 
@@ -181,9 +185,12 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Solve the inverse kinematics for n flange poses (n, 4, 4) through intermediate poses.
+        """Solve the inverse kinematics for n flange poses (n, 4, 4) iteratively.
 
-        joints_rad: joint angles (6,) from which the intermediate poses start.
+        The iteration starts at given joint angles. It follows poses that are interpolated between
+        the flange pose at the start and each goal. It therefore stays near the initial solution.
+
+        joints_rad: joint angles (6,) at the start.
 
         Returns the joint angles (n, 6), rad, and the pose errors (n,), m or rad.
         """
@@ -269,11 +276,11 @@ class NumericKinematics:
         return sorted(found, key=lambda one: float(np.abs(one - self._start).max()))
 
     def find_branch(self, joints_rad: Floats) -> SeedBranch:
-        """Return the branch to which joint angles (6,) rad belong."""
+        """Return the branch (discrete inverse-kinematics solution) of the joint angles (6,) rad."""
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
-        """Return the branches on which the arm can reach a flange pose.
+        """Return the branches (discrete inverse-kinematics solutions) that reach a flange pose.
 
         base_from_flange: n flange poses (n, 4, 4); the first pose that the arm can reach is used.
         """
@@ -287,6 +294,7 @@ class NumericKinematics:
     ) -> Floats:
         """Return joint angles (n, 6), rad, for n flange poses (n, 4, 4) on one branch.
 
+        branch: one of the discrete solutions of the inverse kinematics.
         near_rad: not used, because the branch determines the joint angles.
 
         The angles are NaN if a pose is out of reach.

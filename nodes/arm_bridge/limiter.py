@@ -78,9 +78,9 @@ class SheetLimits:
     """The sum of the compliances of both flanges in the direction of the sheet's tension."""
 
     def sheet_length_m(self, edge_distance_m: float) -> float:
-        """Return the length (m) of a sheet whose tension bends the arms.
+        """Return the length (m) of the stretched sheet between two arms that its tension bends.
 
-        edge_distance_m: distance that the edges would have if the arms were rigid.
+        edge_distance_m: distance between the sheet's edges if the arms were rigid.
         """
         if self.compliance_m_per_n == 0.0 or not self.width_m < edge_distance_m < math.inf:
             return edge_distance_m
@@ -266,9 +266,12 @@ def _longest(shifts: Floats) -> float:
 
 
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
-    """Return the largest blend factor (0 to 1) at which no point moves more than `max_shift_m`.
+    """Return the maximum weight of `fast` in a blend of two sets of displacements.
 
-    slow, fast: displacements (n, 3), m, of n points for the factors 0 and 1.
+    slow, fast: displacements (n, 3), m, of n points.
+
+    The blend is slow + weight * (fast - slow). In the blend, no point moves by more than
+    `max_shift_m`.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)

@@ -158,7 +158,7 @@ class ArmStatus:
 
 @dataclass(frozen=True, slots=True)
 class BlockField:
-    """A field of a block of registers or of a packet.
+    """A field of a Modbus register block or of an MXT packet.
 
     kind: code of Python's `struct`: H (u16), I (u32), i (i32), f (float32) or x (padding).
     """

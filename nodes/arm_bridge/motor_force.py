@@ -96,10 +96,10 @@ class MotorForceEstimator:
         *,
         forward: Callable[[Floats], Floats],
     ) -> Force | None:
-        """Return the estimated force at `at_ns`.
+        """Return the sheet's pull on this arm, estimated from the motor currents at `at_ns`.
 
-        For the other arguments, see `estimate_pull_n`. The result is None at the first call, and if
-        the last estimate is too recent.
+        The result is None at the first call, and if the last estimate is too recent. The estimate
+        is invalid while the arm moves. The arguments have the same meaning as in `estimate_pull_n`.
         """
         before_ns, before_rad = self._last_ns, self._last_rad
         if before_ns is not None and at_ns - before_ns < PERIOD_NS:

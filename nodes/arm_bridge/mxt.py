@@ -79,7 +79,7 @@ _PACKET = struct.Struct("<" + "".join(f"{field.count}{field.kind}" for field in 
 class MxtStatus(ArmStatus):
     """The contents of an answer packet.
 
-    count: number of the controller's communications.
+    count: number of communications since the controller's program started.
     timeouts: number of cycles in which no command arrived.
     """
 

@@ -256,9 +256,12 @@ class ArmBridge(Node):
             self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 
     def _read_goal(self, trajectory: SheetTrajectory | None) -> Goal | None:
-        """Return the goal at the time when the next command takes effect.
+        """Return the desired sheet motion at the time when the next command takes effect.
 
-        trajectory: trajectory of the target, or None if the other arm does not follow it.
+        The result is None if no target has arrived.
+
+        trajectory: trajectory of the last target. None if the other arm does not follow this
+            trajectory.
         """
         target = self.sheet_target.message
         if target is None:

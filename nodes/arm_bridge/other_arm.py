@@ -29,8 +29,8 @@ class OtherArm:
 
     ready: whether the other arm is permitted to move.
     estop_engaged: whether the other arm's bridge has latched an e-stop.
-    agrees: whether the other arm follows a trajectory that overlaps with the own arm's trajectory.
-        The age of the state is then counted from the end of the other arm's trajectory.
+    agrees: whether the trajectories of both arms belong to the same target or to adjacent targets.
+        If so, the age is counted from the end of the other arm's trajectory.
     ended: whether the other arm's bridge has ended.
     """
 
@@ -58,7 +58,7 @@ class OtherArm:
         """Create the state of the other arm from a message of its bridge.
 
         age_s: age of the message.
-        target_source_ns: camera exposure from which the own arm's current target was computed.
+        target_source_ns: camera exposure from which this arm's current target was computed.
         now_ns: present time.
         ended: whether the other arm's bridge has ended.
         """
@@ -102,7 +102,7 @@ class OtherArm:
 
     @property
     def interlock_reason(self) -> str | None:
-        """Return why the other arm's state forbids the own arm's motion, or None if it does not."""
+        """Return why the other arm's state forbids this arm to move, or None if motion is safe."""
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

@@ -149,7 +149,11 @@ class Alignment:
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return the motion that aligns this arm to the path, or the reason why the path is blocked."""
+    """Check whether both arms can move the sheet to its target.
+
+    Returns the joint motion that aligns this arm before the sheet moves, or a text that describes
+    why there is no path. After the alignment, the sheet is flat and on the path.
+    """
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
         return (
@@ -187,13 +191,13 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
 def _check_alignment(
     left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
 ) -> None:
-    """Raise PathError if a straight joint motion of both arms to the path is not permitted.
-
-    The motion is not permitted if a joint moves by more than MAX_ALIGN_RAD, or if a limit of the
-    sheet, of the distance between the flanges, or of the workspace is violated. A limit that is
-    already violated at the start is widened to slightly more than its value at the start.
+    """Check the straight joint motion of both arms to a point on the sheet's path.
 
     begin, there: joint angles of both arms at the start and at the end.
+
+    Raises PathError if a joint moves by more than MAX_ALIGN_RAD. Also raises PathError if the
+    motion violates a limit of the sheet, of the distance between the flanges, or of the workspace.
+    If a limit is already violated at the start, the motion may violate it slightly more.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)

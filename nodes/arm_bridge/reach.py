@@ -2,8 +2,8 @@
 
 Two arms hold the sheet by its left and right edges. An array of n poses of the sheet consists of
 world poses (n, 4, 4) and stretch ratios (n,). Joint angles are (n, 6) rad. A margin is the distance
-to a limit. It is positive if the limit is met. Margins of speeds are fractions of the maximum
-speed. A branch is one of the discrete solutions of the inverse kinematics.
+to a limit, negative if the limit is violated. Margins of speeds are fractions of the maximum speed.
+A branch is one of the discrete solutions of the inverse kinematics.
 """
 
 from __future__ import annotations
@@ -82,7 +82,10 @@ class SheetPoses:
         return len(self.stretch_ratio)
 
     def some(self, chosen: NDArray[np.intp] | Bools) -> SheetPoses:
-        """Return the poses that an array of indices or booleans selects."""
+        """Return a subset of the poses.
+
+        chosen: indices of the poses, or a boolean mask (n,).
+        """
         return SheetPoses(
             self.world_from_sheet[chosen], self.stretch_ratio[chosen], self.twists_world[chosen]
         )
@@ -94,12 +97,13 @@ class SheetPoses:
 
 @dataclass(frozen=True, slots=True)
 class ArmReach:
-    """The joint angles and margins of one arm for n poses of the sheet on one branch.
+    """The joint angles of one arm for n poses of the sheet, and the margins to its limits.
 
+    branch: discrete solution of the inverse kinematics that is used for all poses.
     joints_rad: encoder angles (n, 6); NaN for poses that are out of reach.
-    margins: margins (n,) for each limit in `LIMITS`. Margins that depend on joint angles are NaN
-        for poses that are out of reach. Margins are infinite for singularities that the arm does
-        not have.
+    margins: distances (n,) to each limit in `LIMITS`, negative if the limit is violated. If a pose
+        is out of reach, margins that depend on joint angles are NaN. The margin to a singularity is
+        infinite if the arm's kinematics has no such singularity.
     """
 
     branch: Any
@@ -125,7 +129,10 @@ class ArmReach:
 
     @property
     def trackable(self) -> Bools:
-        """Return whether the arm can reach each pose and follow its twists, as booleans (n,)."""
+        """Return whether the arm can follow the sheet's motion at each pose, as booleans (n,).
+
+        The arm must reach the pose, and the joint speeds for the sheet's twist must be permitted.
+        """
         return np.asarray(self.binding < 0)
 
 
@@ -140,9 +147,10 @@ def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
 def compute_reach(
     geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Any
 ) -> ArmReach:
-    """Compute the joint angles and margins of an arm for poses of the sheet on one branch.
+    """Compute an arm's joint angles for n poses of the sheet, and the margins to the arm's limits.
 
     other: geometry of the arm that holds the other edge.
+    branch: discrete solution of the inverse kinematics that is used for all poses.
     """
     flanges = compute_flange_poses(geometry, places)
     offsets_rad = geometry.joint_offsets_rad
@@ -160,8 +168,9 @@ def compute_reach(
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
     """Return the joint angles and margins on the branch that reaches the most poses.
 
-    Among branches that reach equally many poses, the branch with the larger margins is selected. An
-    arm cannot change its branch while the arm holds the sheet.
+    A branch is one of the discrete solutions of the inverse kinematics. Among branches that reach
+    equally many poses, the branch with the larger margins is selected. An arm cannot change its
+    branch while it holds the sheet.
     """
     still = places.without_twists().some(
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
@@ -186,10 +195,14 @@ def _margins(
     others: Floats,
     places: SheetPoses,
 ) -> dict[str, Floats]:
-    """Return the margins (n,) of all limits for n poses of the sheet.
+    """Return the margins (n,) of each limit as a dict, with the names of the limits as keys.
 
     joints: encoder angles (n, 6) rad.
     flanges, others: world poses (n, 4, 4) of this arm's flange and of the other arm's flange.
+    places: n poses of the sheet.
+
+    A margin is the distance to the limit, and is positive if the limit is met. Margins of speeds
+    are fractions of the maximum speed.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     without = np.full(len(joints), np.inf)
@@ -220,10 +233,12 @@ def _margins(
 def _speeds(
     geometry: ArmGeometry, joints: Floats, flanges: Floats, places: SheetPoses
 ) -> tuple[Floats, Floats]:
-    """Return the maximum joint speeds (n, 6), rad/s, and tool speeds (n,), m/s, over all twists.
+    """Return the maximum joint speeds (n, 6), rad/s, and tool speeds (n,), m/s, at n sheet poses.
 
     joints: encoder angles (n, 6), rad.
-    flanges: world poses (n, 4, 4) of the flange for n poses of the sheet.
+    flanges: world poses (n, 4, 4) of the flange.
+    places: n poses of the sheet, each with several twists (velocities) of the sheet. The maximum is
+        taken over these twists.
     """
     fastest, tool = np.zeros_like(joints), np.zeros(len(joints))
     centre = places.world_from_sheet[:, :3, 3]
@@ -247,7 +262,10 @@ def _speeds(
 
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
-    """Return the tool points (n, 4, 3), m, in the world frame for n flange poses (n, 4, 4)."""
+    """Return four points of the tool in the world frame, (n, 4, 3) m, for n flange poses (n, 4, 4).
+
+    The points are the centre and both ends of the clamped edge, and the flange's origin.
+    """
     points = np.einsum("nij,pj->npi", flanges[:, :3, :3], geometry.tool_points_flange)
     return np.asarray(points + flanges[:, None, :3, 3])
 
@@ -409,9 +427,11 @@ def solve_step(
 
 
 def interpolate_sheet(start: SheetMotion, goal: SheetMotion, fraction: float) -> SheetMotion:
-    """Return the sheet at rest on the straight path between two poses.
+    """Interpolate position, rotation and stretch of the sheet linearly between two poses.
 
-    fraction: position on the path, 0 to 1.
+    fraction: position between the poses, 0 at the start and 1 at the goal.
+
+    The velocities of the result are zero.
     """
     begin, end = start.world_from_sheet, goal.world_from_sheet
     rotation_vector = vector_from_rotation(end[:3, :3] @ begin[:3, :3].T)

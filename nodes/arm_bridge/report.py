@@ -18,9 +18,13 @@ there are five reports per second."""
 
 @dataclass(slots=True)
 class LastExchange:
-    """The times (ns on this computer's clock) of the newest exchange with the arm.
+    """The times of the newest sheet target, and of the newest exchange with the arm.
 
-    target, received_ns: header and arrival time of the sheet target.
+    An exchange consists of a command and the arm's answer. All times are in ns on this computer's
+    clock.
+
+    target: header of the message with the sheet target.
+    received_ns: arrival time of this message.
     trajectory_ends_ns: end of the target's trajectory; 0 if there is no trajectory.
     sent_ns, measured_ns: times of the last command and of the last answer; 0 before the first
         exchange.
@@ -47,9 +51,11 @@ class LatencyMean:
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Include the latency of an exchange in the mean, unless its target was included already.
+        """Add the latency of a new sheet target to the mean latency.
 
-        Returns the mean latency (s) after every REPORTED_TARGETS targets, and None in between.
+        The latency is the time from the camera exposure to the command, plus the arm's servo lag.
+        Nothing is added if the target was added before, or if the servo lag is unknown. Returns the
+        mean latency (s) after every REPORTED_TARGETS targets, and None in between.
         """
         target, before = exchange.target, self._target
         self._target = target

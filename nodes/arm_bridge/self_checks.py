@@ -24,8 +24,8 @@ class ServoCheck:
     configured_lag_s: lag of the arm according to the parameters.
     command_period_s: period of the commands to the arm.
 
-    An overloaded computer sends commands late and reads answers late. A deviation of the lag that
-    these delays explain is ignored.
+    An overloaded computer sends commands late and reads answers late, which changes the estimated
+    lag. The check ignores the part of a lag deviation that such delays can cause.
     """
 
     def __init__(self, side: Side, configured_lag_s: float, command_period_s: float) -> None:
@@ -36,9 +36,12 @@ class ServoCheck:
         self._expected_rad = 0.0
 
     def update(self, estimate: LagEstimate | None, at_ns: int) -> tuple[SelfCheck, ...]:
-        """Include a new estimate of the servo lag in the checks; return those with enough data.
+        """Update the checks with an estimate of the servo lag, and return their results.
 
+        estimate: new estimate, or None if there is none.
         at_ns: time of the estimate.
+
+        The result is empty until there is enough data.
         """
         if estimate is not None:
             deviation_s = estimate.lag_s - self._configured_lag_s

@@ -61,7 +61,8 @@ class StandstillMonitor:
     def is_standing(self, *, at_command: bool) -> bool:
         """Return whether the arm is at rest.
 
-        at_command: whether the measured joint angles are near the last command.
+        at_command: whether the measured joint angles are near the last command. If they are not,
+            more unchanged measurements are required, because the measurements can lag.
         """
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 
@@ -75,7 +76,10 @@ class StandstillMonitor:
         self._last_rad = np.full(6, np.nan)
 
     def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
-        """Record the joint angles (6,) and velocities (6,) of a command for `step_s` seconds."""
+        """Record the joint angles (6,) and velocities (6,) that were sent as the latest command.
+
+        step_s: time during which the arm executes the command.
+        """
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
         decay = max(0.0, 1.0 - step_s / MEMORY_S)

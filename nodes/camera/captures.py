@@ -130,7 +130,10 @@ class AravisCapture(CapturedDevice):
         self._camera = self._call(lambda: self._aravis.Camera.new(device or None), "open")
 
     def _call(self, call: Any, what: str) -> Any:
-        """Call a function of Aravis. If it fails, raise DeviceError with the action `what`."""
+        """Call a function of the camera library Aravis, and convert its errors to DeviceError.
+
+        what: verb phrase for the error message, for example "start the stream".
+        """
         try:
             return call()
         except Exception as error:  # GLib.Error, which is known only after the import.

@@ -176,8 +176,8 @@ class VideoReader(FileReader):
 class _LoopClock:
     """A clock whose time continues to increase when a file is read again from its start.
 
-    The interval between two passes equals the interval between the last two images of the file, or
-    1 / rate_hz if the file has a single image.
+    Between the last image and the first image of the repetition, the time increases by the interval
+    between the last two images. If the file has a single image, the time increases by 1 / rate_hz.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -186,7 +186,10 @@ class _LoopClock:
         self._newest_ns: int | None = None
 
     def continuous_ns(self, time_ns: int) -> int:
-        """Convert a time (ns) in the current pass to a time (ns) since the start of the clock."""
+        """Convert the time (ns) of an image in the file to a continuously increasing time (ns).
+
+        When the file is read again from its start, the returned time continues to increase.
+        """
         continuous_ns = self._start_ns + time_ns
         if self._newest_ns is not None:
             self._interval_ns = continuous_ns - self._newest_ns

@@ -87,8 +87,8 @@ class HeadCamera(Node):
     """A node that publishes the positions of the user's eyes from the images of a UVC camera.
 
     The distance of the eyes is computed from the interocular distance in the scene and from the
-    focal length. If the camera, its packages or a face are missing, the node publishes invalid
-    eyes. The renderer then uses the eye positions in the scene.
+    focal length. If the camera, its packages or a face are missing, the published message is marked
+    as invalid. The renderer then uses the eye positions in the scene.
     """
 
     opens_devices: ClassVar[bool] = True
@@ -180,10 +180,10 @@ class HeadCamera(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Publish invalid eye positions while no images arrive.
+        """Publish that the eye position is invalid if no images arrive.
 
-        The timestamp is `silence_s` in the past, and therefore older than the timestamp of an image
-        that is still being searched.
+        The message has a timestamp in the past, by the parameter `silence_s` plus the camera's
+        delay. Therefore it is older than the result of an image that is still being processed.
         """
         p = self.parameters
         at_ns = self.clock.now_ns() - round(1e9 * (p.delay_s + p.silence_s))

@@ -45,8 +45,8 @@ def find_visible_region(
     points_camera: n points (n, 3) in the camera frame, m.
 
     Returns None if no point is visible, and the full sensor if some points are behind the camera.
-    The distortion polynomial is invalid beyond the image's corners. Points beyond the corners are
-    therefore moved to the circle through the farthest corner.
+    The distortion polynomial is invalid outside the image. Rays to points outside the image are
+    therefore rotated to the view angle of the farthest image corner.
     """
     in_front = points_camera[points_camera[:, 2] > NEAREST_M]
     if len(in_front) == 0:

@@ -156,7 +156,8 @@ class AccessControl:
 def _names_an_address(host: str) -> bool:
     """Return whether a Host header contains an IP address or localhost.
 
-    Another web site could make any other host name refer to this computer.
+    The console rejects all other names. An attacker's web site could make its own host name resolve
+    to this computer (DNS rebinding).
     """
     try:
         name = urlsplit(f"//{host}").hostname or ""

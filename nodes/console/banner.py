@@ -167,9 +167,10 @@ def _after_reset(state: GraphState) -> str:
 
 
 def _explain(state: GraphState, shown: BannerState) -> str:
-    """Return the reason why an arm without a fault does not follow the finger.
+    """Return the reason why an arm does not follow the finger, or describe the sheet's state.
 
-    If there is no such arm, return a sentence about the state of the sheet.
+    Arms with faults are ignored here. If all other arms follow the finger, the result is a sentence
+    about the sheet.
     """
     if shown is BannerState.ESTOP:
         return ""

@@ -148,12 +148,12 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """A requester of eye views. Only one is requested at a time, because ray tracing is slow.
+    """A requester of eye views, which are simulated images at the user's eye.
 
-    For each view, the renderer draws one frame and publishes its pixels. From this frame, the
-    simulated eye computes the view. Afterwards, the previous display settings are restored. If no
-    other node has sent display settings, the image correction of the scene or of the console is
-    restored.
+    Only one view is requested at a time, because ray tracing is slow. For each view, the renderer
+    draws one frame and publishes its pixels. From this frame, the simulated eye computes the view.
+    Afterwards, the previous display settings are restored. If no other node has sent display
+    settings, the image correction of the scene or of the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -185,15 +185,18 @@ class EyeViewRequester:
     def on_scene(self, scene: Scene) -> None:
         """Apply the image correction that a new scene specifies.
 
-        A renderer that has received a display message ignores the correction of later scenes. If
-        the console has sent such a message, this method publishes the new correction.
+        If the console has sent display settings, the renderer ignores the correction in later
+        scenes. In this case, this method publishes display settings with the new correction.
         """
         self._by_scene = scene.methods.correction
         if self._owns_display and not self._borrowed:
             self._restore_display()
 
     def on_others_display(self, display: Display) -> None:
-        """Store the display settings of another node, which an eye view must restore."""
+        """Store the display settings that another node has published.
+
+        An eye view changes the display settings, and restores these settings when it is finished.
+        """
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
@@ -228,16 +231,25 @@ class EyeViewRequester:
         )
 
     def request_now(self) -> None:
-        """Request the next eye view without waiting for the end of the period."""
+        """Request the next eye view immediately.
+
+        Without this call, eye views are requested at intervals of EYE_VIEW_PERIOD_S.
+        """
         self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:
-        """Enter the state TRACING if a frame contains the requested pixels."""
+        """Enter the state TRACING if a frame contains the pixels that this console requested.
+
+        In this state, the simulated eye computes the view from the frame.
+        """
         if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """End the request to which an image belongs; return whether this console requested it."""
+        """End the request that an image of the simulated eye answers.
+
+        Returns whether this console requested the image.
+        """
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -331,12 +343,12 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """A publisher of e-stops, recording requests and bookmarks, which saves the console's state.
+    """The controller of the console, which publishes e-stops, recording requests and bookmarks.
 
     warn: function that receives an error text if the saved state cannot be used.
 
-    After a restart, the console continues with the saved scene, slider positions, finger position
-    and recording request.
+    The state is saved. After a restart, the console continues with the saved scene, slider
+    positions, finger position and recording request.
     """
 
     def __init__(

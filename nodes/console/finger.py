@@ -49,11 +49,11 @@ class Ray:
 
 @dataclass(frozen=True, slots=True)
 class FingerIntent:
-    """A finger position that a viewer requests.
+    """A finger position that a viewer of the console page requests.
 
-    position: ray that selects a point on any object.
-    depth_m: depth below the surface if the finger is not lifted.
-    lifted: whether the finger hovers above the point.
+    position: ray in the world frame; the finger is placed where the ray meets the object.
+    depth_m: depth of the finger below the surface if the finger is not lifted.
+    lifted: whether the finger hovers above the surface instead.
 
     Raises ValueError if the depth is negative or not finite.
     """

@@ -1,4 +1,7 @@
-"""Read the constant properties of the graph that the console needs from the plan of a run."""
+"""Read properties of the node graph from the plan file of a run.
+
+The console needs these properties. They are constant during a run.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ from flexsheet.nodes import NodeRole
 class GraphFacts:
     """The properties of the graph that are constant while the console runs.
 
-    others_may_reset: other hosts that may reset an e-stop; empty if the console's own host may
-        reset it.
+    others_may_reset: hosts that may reset an e-stop if the console's own host may not; otherwise
+        empty.
     recorders: names of the recorder nodes.
     records_on_request: whether a recorder waits for a message on the topic `recording`.
     solvers: names of the nodes that publish the surface mesh of the soft object.

@@ -56,7 +56,11 @@ class LatestMessages:
 
 
 def check_type(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
-    """Return the entry unchanged; raise TypeError if its message does not have the type `kind`."""
+    """Return a message and its header unchanged, after a check of the message's type.
+
+    Raises TypeError if the message does not have the type `kind`. The entry None is also returned
+    unchanged.
+    """
     if entry is None:
         return None
     message, header = entry

@@ -87,7 +87,8 @@ class ConsoleParameters(NodeParameters):
 class Console(Node):
     """A node that serves the console page.
 
-    While viewers have opened the page, the node decodes the latest messages at its own rates.
+    While the page is open in a browser, the node updates the 3D view, the tables and the charts.
+    The parameters `rate_hz` and `tables_hz` set the update rates.
     """
 
     takes_frames: ClassVar[bool] = True

@@ -263,7 +263,11 @@ class Operator:
         )
 
     def _solver_note(self) -> str:
-        """Return the note of the soft-body solver, or "" if it has published the surface mesh."""
+        """Return the status note of the soft-body solver while its surface mesh is not available.
+
+        Returns an empty text as soon as the solver has published the surface mesh of the present
+        scene.
+        """
         skin = self._live.latest("skin", Skin)
         if skin is not None and skin[1].source_ns >= self._sent_ns:
             return ""

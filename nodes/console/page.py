@@ -34,7 +34,8 @@ class Page:
 
         request: function that passes a viewer's request to the node.
         with_finger: whether the page has controls for the finger.
-        others_may: other hosts that may reset an e-stop; empty if the console's host may reset it.
+        others_may: hosts that may reset an e-stop if the console's own host may not; otherwise
+            empty.
         """
         self._gui: Any = server.gui
         self._request, self._others_may = request, others_may

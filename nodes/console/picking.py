@@ -32,9 +32,9 @@ class SurfacePicker:
 
     max_depth_m: maximum push depth of the working range.
 
-    If the object is a mesh, construction takes a second. Position, tilt and depth are limited to
-    the scene's working range. A point beyond the rim of the touchable surface, where the tilt is
-    permitted, is replaced by a point before the rim.
+    Position, tilt and depth are limited to the scene's working range. A point outside the touchable
+    part of the surface is replaced by a touchable point slightly inside the edge of this part. If
+    the object is a mesh, construction takes a second.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -86,8 +86,9 @@ class SurfacePicker:
 
         near: point (3,) in the object's frame, m.
 
-        The search starts at the front of the object. It follows the straight line to the surface
-        point nearest to `near`, and then the remaining distance along the world's x and y axes.
+        If the nearest surface point is not touchable, the result moves from the object's front
+        towards this point while it remains touchable. Then it moves along the world's x axis and y
+        axis to reduce the remaining distance.
         """
         found = self._shape.closest(near)
         outwards = found.point - self._front_m

@@ -369,7 +369,10 @@ class SceneView:
 
 
 def lift_sheet(points: Floats, lift_m: float) -> Floats:
-    """Move the sheet's n points (n, 3), in m, towards the user along the sheet's mean normal."""
+    """Move the sheet's n points (n, 3), in m, by `lift_m` towards the user, along the mean normal.
+
+    In the 3D view, a flat object in the plane of the sheet would otherwise flicker.
+    """
     first, last = points[0], points[-1]
     right, left = points[COLUMNS - 1], points[-COLUMNS]
     normal = np.cross(right - left, last - first)

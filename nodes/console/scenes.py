@@ -119,7 +119,7 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return how far (m) an object's touchable surface extends from its origin to the user.
+    """Return how far (m) an object's touchable surface extends from its origin towards the user.
 
     world_from_object: rotation matrix (3, 3) of the object.
 

@@ -61,16 +61,16 @@ def compute_sheet_points(
 def film(
     x: Floats, y: Floats, finger: tuple[float, float], size_m: tuple[float, float], radius_m: float
 ) -> Floats:
-    """Compute the deflection (n,) of a film that is clamped at x = +-width / 2, at n points.
+    """Return the deflection of a film that a finger pushes, divided by the depth of the finger.
 
-    x, y: coordinates (n,) of the points, m.
+    x, y: coordinates (n,) of the points at which the deflection is computed, m.
     finger: position (x, y) of the finger, m.
-    size_m: width and height of the film.
+    size_m: width and height of the film, which is clamped at x = +-width / 2.
+    radius_m: radius of the finger. Within this distance of the finger, the result is 1.
 
-    The deflection is divided by the depth of the finger, and it is 1 within `radius_m` of the
-    finger. It solves Laplace's equation for a point force in an infinite strip. The Green's
-    function of this problem follows from a conformal map. The free edges at y = +-height / 2 are
-    represented by mirror images of the finger.
+    The result has the shape (n,). The deflection solves Laplace's equation for a point force in an
+    infinite strip. The Green's function of this problem follows from a conformal map. The free
+    edges at y = +-height / 2 are represented by mirror images of the finger.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger

@@ -231,9 +231,11 @@ def _scales(top_ms: float) -> dict[str, Any]:
 
 
 def max_latency_ms(columns: tuple[Floats, ...]) -> float:
-    """Return the upper limit of the chart's scale, ms: 1, 2, 5, 10 and so on.
+    """Return the upper limit of the latency axis of a chart, ms.
 
-    columns: n times (n,), s, and latency series (n,), ms.
+    The limit is the first of the values 1, 2, 5, 10, 20, 50 and so on that no latency exceeds.
+
+    columns: times (n,), s, followed by the latency series (n,), ms.
     """
     values = np.concatenate(columns[1:])
     largest = float(values[np.isfinite(values)].max(initial=1.0))

@@ -64,9 +64,9 @@ MAX_DISPLACEMENT = "largest_move_mm"
 
 
 class SkinSolution(Protocol):
-    """The interface of a method's result for one push.
+    """A soft-body solution for one push, as any of the methods returns it.
 
-    It consists of the displacement (s, 3), m, of the s skin nodes, and the force (3,), N.
+    displacement (s, 3): displacement of the s skin nodes, m. force_n (3,): force, N.
     """
 
     @property
@@ -80,10 +80,13 @@ class SkinSolution(Protocol):
 class SoftBodyBenchmark:
     """A benchmark of the soft-body methods for pushes at one surface point of a scene's object.
 
-    depths_m: push depths. linear_m, table_m: distance between skin nodes (m) for each linear method
-    and each table. The keys are the names of the methods. newton_m: depths at which the time of
-    full Newton solutions is measured. focused: skin spacings of the reference meshes that are fine
-    only near the finger, in finger radii. even_m: skin spacings of the even reference meshes, m.
+    depths_m: push depths.
+    linear_m, table_m: distances between skin nodes (m) of the linear methods and of the nonlinear
+        tables. The keys are the names of the methods.
+    newton_m: depths at which the time of full Newton solutions is measured.
+    focused: distances between skin nodes of the reference meshes that are fine only near the
+        finger, in finger radii.
+    even_m: distances between skin nodes (m) of the reference meshes with uniform spacing.
     """
 
     scene: Scene
@@ -96,9 +99,9 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the body with its linear method, and its precomputed model (cached if possible).
+        """Return the soft body with the linear method, and its precomputed linear response.
 
-        spacing_m: distance between skin nodes.
+        The response is loaded from the cache if possible. spacing_m: distance between skin nodes.
         """
         spec = make_soft_body_spec(self.scene, spacing_m)
 
@@ -119,7 +122,7 @@ class SoftBodyBenchmark:
         return body, model
 
     def coarsest(self) -> SceneBody:
-        """Return the soft body with the coarsest skin mesh, which uses the linear method."""
+        """Return the soft body with the coarsest skin mesh, for the linear method."""
         return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
 
     def sample(self) -> SamplePoint:
@@ -129,7 +132,7 @@ class SoftBodyBenchmark:
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return the name and job (inputs) of each reference solution, most accurate first."""
+        """Return the name and the inputs of each reference solution, most accurate first."""
         body, sample = self.coarsest(), self.sample()
         jobs = []
         has_focused = snapshots.has_focused_meshes(body.spec.mesh)
@@ -146,9 +149,10 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return tables that cover only the skin near the push, by name of the method.
+        """Return nonlinear tables that cover only the skin near the push.
 
-        Methods whose full table is cached are omitted.
+        The keys of the result are the names of the methods. Methods whose full table is cached are
+        omitted.
         """
         found = {}
         for name, spacing in self.table_m.items():
@@ -242,7 +246,11 @@ class SoftBodyBenchmark:
 
 
 class ReferenceSet:
-    """The reference solutions of pushes at one point, in order of decreasing accuracy."""
+    """Reference solutions for pushes at one surface point, sorted from most to least accurate.
+
+    The error of a method is its difference from the most accurate solution. The uncertainty is the
+    difference between the two most accurate solutions.
+    """
 
     def __init__(
         self, references: Sequence[ReferenceSolution], sample: SamplePoint, scene: Scene
@@ -260,11 +268,13 @@ class ReferenceSet:
         *,
         in_range: bool,
     ) -> Trial:
-        """Return the trial of a method at one push depth.
+        """Return the trial (measurement) of a method at one push depth.
 
-        rest (s, 3): undeformed positions of the s skin nodes, m. run: function that computes the
-        solution. in_range: whether the method is valid at this depth. The error is NaN if no
-        reference converged at the depth.
+        rest (s, 3): undeformed positions of the s skin nodes, m.
+        run: function that computes the solution.
+        in_range: whether the method is valid at this depth.
+
+        The error is NaN if no reference converged at the depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
         present = [one for one in self._references if one.reaches(depth_m)]
@@ -324,9 +334,10 @@ def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
 
 
 def _family(methods: Sequence[str], **changes: Any) -> Family:
-    """Return the benchmark of some soft-body methods.
+    """Define a benchmark of soft-body methods for the benchmark charts.
 
-    changes: changed fields of the `SoftBodyBenchmark`.
+    methods: names of the methods that are measured.
+    changes: values that replace fields of the default `SoftBodyBenchmark`.
     """
 
     def benchmark(scene: Scene) -> SoftBodyBenchmark:

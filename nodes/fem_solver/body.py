@@ -77,7 +77,7 @@ def make_soft_body_spec(
 
 
 def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
-    """Return the inputs from which the nonlinear table of a body is computed."""
+    """Return the inputs from which a soft body's table of nonlinear push responses is computed."""
     return TableSpec(spec, scene.finger.radius_m)
 
 
@@ -131,7 +131,11 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, with the stiffness at the front of the object."""
+        """Return the response of the body while the finger does not touch it.
+
+        Displacement and force are zero. Stiffness and force curve belong to the front of the
+        object.
+        """
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -152,10 +156,11 @@ class SceneBody:
         horizon_s: float = 0.0,
         replaced: Sequence[SceneBody] = (),
     ) -> SoftBody:
-        """Return the message about a response, with vectors in the world frame.
+        """Return the message with a response of this soft body, with vectors in the world frame.
 
-        horizon_s: time from the camera exposure to the predicted fingertip position. replaced:
-        earlier bodies that still contribute to the response during a gradual transition.
+        horizon_s: time from the camera exposure to the predicted fingertip position.
+        replaced: previous soft bodies, for example of a less accurate method. During a transition,
+            they still contribute to the response.
         """
         errors = [one.force_error_ratio(response.push_depth_m) for one in (self, *replaced)]
         rotation = self.world_from_mesh[:3, :3]
@@ -230,9 +235,9 @@ def build_scene_body(
 def attach_table(
     body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table, *, quick: bool = False
 ) -> SceneBody:
-    """Return a copy of the body that uses the nonlinear table as its method.
+    """Return a copy of the body that computes its responses from a precomputed nonlinear table.
 
-    quick: whether the table is the coarse table, which is computed from only a few snapshots.
+    quick: whether the table is the coarse table, which is computed first from only a few pushes.
     """
     method = TableSoftBody(
         model.response,

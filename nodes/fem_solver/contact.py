@@ -102,8 +102,9 @@ class Response:
 class SoftBodyMethod(Protocol):
     """The interface of the methods that compute the response of a soft body to the finger.
 
-    name: name of the method in messages. at_rest (s, 3): displacement of the s skin nodes if the
-    finger does not touch the skin, which is zero.
+    name: name of the method in messages.
+    at_rest (s, 3): zero displacement of the s skin nodes, for a finger that does not touch the
+        skin.
     """
 
     @property
@@ -162,10 +163,13 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 
 
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
-    """Return the depths (m) at which a force curve is sampled.
+    """Return the depths (m) at which the force curve of a push is sampled.
 
-    The depths are dense up to `linear_m`. Larger depths increase geometrically up to the larger
-    value of `largest_m` and `push_m`.
+    linear_m: end of the linear range, in which the depths are closely spaced.
+    largest_m: minimum value of the greatest depth.
+    push_m: required greatest depth; None if `largest_m` is sufficient.
+
+    Beyond `linear_m`, the depths increase geometrically to the larger of `largest_m` and `push_m`.
     """
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
     deeper = np.geomspace(
@@ -243,9 +247,11 @@ class SphereContact:
         return result
 
     def solve(self, query: ContactQuery, depth_m: float) -> NormalContact | None:
-        """Solve the contact of a finger at a depth (m) below the surface point of a query.
+        """Solve the contact of a spherical finger at a depth (m) below a surface point.
 
-        Return None if the finger touches no contact point. The depth in the query is ignored.
+        query: surface point and its normal. The depth in the query is ignored.
+
+        Returns None if the finger does not touch the object.
         """
         centre = query.surface + (self._radius - depth_m) * query.normal
         limit = FLANK_RATIO * self._radius
@@ -301,9 +307,10 @@ class DragContact:
     def solve(self, contact: NormalContact, drag: Floats) -> tuple[Ints, Floats, Floats]:
         """Return the tangential forces of a sticking finger for a given normal contact.
 
-        drag (3,): displacement of the finger since it started to stick, m. Return row indices (2k,)
-        of `influence` for the k loaded nodes, the forces (2k,), N, for these rows, and the total
-        force (3,), N.
+        drag (3,): displacement of the finger since it started to stick, m.
+
+        Returns three arrays: row indices (2k,), forces (2k,), N, and the total force (3,), N. The
+        indices select rows of the attribute `influence`, two for each of the k loaded nodes.
         """
         nodes, count = contact.nodes, len(contact.nodes)
         rows = (2 * nodes[:, None] + np.arange(2)).ravel()
@@ -360,11 +367,11 @@ def solve_penalty_contact(
 def _search_step(
     forces: Floats, target: Floats, problem: tuple[Floats, Floats, Floats, Floats]
 ) -> float:
-    """Return the largest fraction (1, 1/2, 1/4...) of a step that decreases the contact energy.
+    """Return the largest step fraction (1, 1/2, 1/4 and so on) that decreases the contact energy.
 
     forces, target (k,): forces (N) on k nodes at the start and at the end of the full step.
-    problem: compliance of the nodes, compliance at the contact points, penalty and depths, as in
-    `solve_penalty_contact`.
+    problem: four arrays that define the energy, as in `solve_penalty_contact`: node compliance,
+        compliance at the contact points, penalty stiffness and depths.
     """
     compliance, compliance_at_points, penalty, depths = problem
 
@@ -402,10 +409,14 @@ class LinearSoftBody:
     ) -> None:
         """Precompute the force curves of all touchable mesh corners.
 
-        bounds (b, 3): positions of the b skin nodes that must not be touched. Pushes next to these
-        nodes are reported as out of range. push_depth_m: depth at which the force curve ends; if it
-        is None, the curve ends at `max_depth_m`. drag: tangential response for a sticking finger,
-        or None if there is no friction. Raises ValueError unless 0 < linear_depth_m < max_depth_m.
+        bounds (b, 3): positions of the skin nodes that the finger cannot touch. Pushes near these
+            nodes are reported as out of range.
+        linear_depth_m: depth above which pushes are reported as out of range.
+        max_depth_m: depth above which the displacement does not increase.
+        push_depth_m: depth at which the force curve ends; None means `max_depth_m`.
+        drag: tangential response for a sticking finger, or None if there is no friction.
+
+        Raises ValueError unless 0 < linear_depth_m < max_depth_m.
         """
         if not 0.0 < linear_depth_m < max_depth_m:
             raise ValueError(
@@ -517,9 +528,11 @@ class LinearSoftBody:
 def unit_linear_body(
     response: SkinResponse, shape: Shape, bounds: Floats, finger_radius_m: float
 ) -> LinearSoftBody:
-    """Return the linear method for a modulus of 1 Pa and a linear range of one finger radius.
+    """Return a linear soft body with a Young's modulus of 1 Pa.
 
-    bounds (b, 3): positions of the b skin nodes that must not be touched.
+    Pushes deeper than one finger radius are out of the linear range.
+
+    bounds (b, 3): positions of the skin nodes that the finger cannot touch.
     """
     return LinearSoftBody(
         response,

@@ -168,11 +168,14 @@ class NestedDissection:
         return Factors(self.fronts, diagonal, off_diagonal)
 
     def _split(self, members: Ints) -> tuple[int, Ints, Ints]:
-        """Divide elements recursively, and append each part after its halves to the list of parts.
+        """Divide elements recursively into a binary tree of parts.
 
-        members: indices of the elements. Return the index of the last part, its k free nodes (k,),
-        and a count (k,) for each of these nodes. The count is the number of elements in the part
-        that contain the node.
+        The parts are appended to a list, the two children before their parent.
+
+        members: indices of the elements.
+
+        Returns the list index of the tree's root, and the indices (k,) of the k free nodes of the
+        elements. Also returns the number (k,) of these elements that contain each node.
         """
         if len(members) <= LEAF_ELEMENTS:
             present, counts = np.unique(self._elements[members], return_counts=True)

@@ -260,14 +260,16 @@ class NeoHookeanBody:
     def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
     ) -> Iterator[EquilibriumState]:
-        """Move the finger in a straight line to each centre (3,), m, and yield the equilibrium
-        there.
+        """Move the finger in a straight line to each position, and yield the equilibrium there.
 
-        start: displacement (n, 3) of the nodes and centre (3,) of the spherical fingertip in a
-        known equilibrium, m. If `start` is None, the sphere at the first centre must not touch the
-        body. If a step does not converge, the last equilibrium is yielded with `reached` false for
-        all remaining centres. A step with inverted elements or with the sphere inside the body has
-        not converged. Raises ValueError if a coordinate of a centre is not finite.
+        centres: positions (3,), m, of the centre of the spherical fingertip.
+        start: displacement (n, 3) of the nodes and centre (3,) of the fingertip in a known
+            equilibrium, m. If `start` is None, the sphere at the first position must not touch the
+            body.
+
+        If a step does not converge, the last equilibrium is yielded with `reached` false for all
+        remaining positions. A step with inverted elements or with the sphere inside the body has
+        not converged. Raises ValueError if a coordinate of a position is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
@@ -310,9 +312,10 @@ class NeoHookeanBody:
     ) -> tuple[Floats, Factors | None]:
         """Find the equilibrium for a spherical fingertip at `centre` (3,) by Newton's method.
 
-        The iteration starts at `displacement` or `guess` (n, 3), m. The start with less energy is
-        used. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
-        stiffness. Raises NewtonNotConvergedError if the iteration does not converge.
+        The iteration starts at `displacement` or `guess` (n, 3), m, whichever has less energy.
+
+        Returns the displacement (n, 3) at equilibrium, and the last factorization of the tangent
+        stiffness matrix. Raises NewtonNotConvergedError if the iteration does not converge.
         """
         nodes = self.solid.nodes
         if self._energy(guess, centre) < self._energy(displacement, centre):

@@ -149,7 +149,8 @@ class FemSolver(Node):
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
         """Compute the nonlinear table in the background, and use it when it is finished.
 
-        Until then, the linear method computes the responses, and later the coarse table.
+        Until then, responses come from the linear method, or from a coarse table as soon as it
+        exists.
         """
         loop = asyncio.get_running_loop()
         stop = self._stop
@@ -218,7 +219,10 @@ class FemSolver(Node):
         self.soft_body.publish(message, source_ns=header.source_ns)
 
     def _end_transitions(self) -> None:
-        """Remove the replaced soft bodies that no longer contribute to the responses."""
+        """Remove previous soft bodies whose transition to the present soft body has ended.
+
+        During a transition, the responses of both soft bodies are blended.
+        """
         if not self._replaced:
             return
         begin_ns = self.clock.now_ns() - round(1e9 * BLEND_S)
@@ -230,7 +234,14 @@ class FemSolver(Node):
     def _blend_in(
         self, response: Response, respond: Callable[[body.SceneBody], Response]
     ) -> Response:
-        """Return the weighted mean of a response and the responses of recently replaced bodies."""
+        """Return the response of the current body, blended with those of recently replaced bodies.
+
+        When a more accurate body replaces another one, the response changes gradually within
+        BLEND_S.
+
+        response: response of the current body.
+        respond: function that returns the response of another body to the same finger position.
+        """
         if not self._replaced:
             return response
         now_ns = self.clock.now_ns()
@@ -246,12 +257,15 @@ async def run_unless_superseded(
     progress: Callable[..., None],
     is_superseded: Callable[[], bool],
 ) -> T:
-    """Run a function in a thread, and return the result unless a newer request arrives.
+    """Run a function in a thread, and return its result unless a newer request arrives.
 
-    compute: function that is run. Its argument is a progress callback. progress: function that the
-    callback calls with a stop event as an additional first argument. is_superseded: function that
-    returns whether a newer request has arrived. Raises Interrupted if a newer request arrives. The
-    thread then ends later, and its errors are ignored.
+    compute: function that is run. Its argument is a callback with which it reports progress.
+    progress: function that receives the reports of progress. Its first argument is an event that is
+        set when the computation should stop.
+    is_superseded: function that returns whether a newer request has arrived.
+
+    Raises Interrupted if a newer request arrives. The thread then ends later, and its errors are
+    ignored.
     """
     stop = Event()
     task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))

@@ -78,11 +78,13 @@ class SoftBodySpec:
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyModel:
-    """The precomputed elastic response of a soft body and its skin mesh.
+    """The precomputed elastic response of a soft body, and its skin mesh.
 
-    response: response to normal forces. triangles (t, 3): skin triangles with outward normals.
-    bounds (s,): true for each skin node that the finger must not touch; false on end faces. drag:
-    response to tangential forces; None if the finger does not stick to the skin.
+    response: response to normal forces.
+    triangles (t, 3): skin triangles with outward normals.
+    bounds (s,): whether the finger must not touch each skin node, for example because the support
+        fixes the node. Nodes on end faces are not marked.
+    drag: response to tangential forces; None if the finger does not stick to the skin.
     """
 
     response: SkinResponse
@@ -230,11 +232,14 @@ def _solve_unit_loads(
     get_part: Callable[[int, Callable[[], Part]], Part],
     advance: Callable[[int], None],
 ) -> tuple[Singles, Floats]:
-    """Compute the displacements for unit forces in p directions on each of m contact nodes.
+    """Compute the displacements for unit forces at m contact nodes, each in p directions.
 
-    directions (m, p, 3): unit vectors. get_part: function that loads the stored part with an index,
-    or computes and stores it. advance: function that receives the number of newly finished unit
-    forces. Return the displacements per force, m/N. The first array (m p, 3s) contains the
+    directions (m, p, 3): unit vectors.
+    get_part: function that returns the results of a group of loads. The arguments are the index of
+        the first load, and a function that computes the group if it is not stored.
+    advance: function that receives the number of newly finished unit forces.
+
+    Returns two arrays of displacements per force, m/N. The first array (m p, 3s) contains the
     displacements of the s skin nodes. The second array (m p, m p) contains the displacements of the
     contact nodes along each direction.
     """
@@ -294,7 +299,11 @@ STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
-    """Return the cache key of a linear response, and its functions for encoding and decoding."""
+    """Define how the linear response of a soft body is stored in the cache.
+
+    The result consists of the cache key, a function that encodes a response, and a function that
+    decodes a stored response.
+    """
 
     def encode(model: SoftBodyModel) -> dict[str, NDArray[Any]]:
         content = {"triangles": model.triangles, "bounds": model.bounds}

@@ -138,7 +138,7 @@ def code_version() -> str:
 
 
 def make_table_cache(spec: TableSpec) -> Specification[Table]:
-    """Return the cache key of a nonlinear table, and its functions for encoding and decoding."""
+    """Return the cache key of a nonlinear table, with functions that encode and decode tables."""
     return Specification(
         "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
     )
@@ -257,10 +257,13 @@ def _compute_table(
 def _interpolate_by(
     executor: Executor, on_progress: Callable[[int, int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the snapshots of all jobs by an executor; return results in the jobs' order.
+    """Fill the nodes of a nonlinear table by interpolation between precomputed pushes, in parallel.
 
     on_progress: function that receives the number of finished nodes and the total number. Nodes
-    that are mirror images of other nodes are in no job and are not counted.
+        that are mirror images of other nodes are not counted.
+    jobs: groups of nodes, each of which is one task of the executor.
+
+    Returns the results in the order of the jobs.
     """
     filled: dict[int, FilledNodes] = {}
     total = sum(len(job.samples) for job in jobs)

@@ -60,10 +60,13 @@ class ReferenceSolution:
         return bool((np.abs(depths - depth_m) < 1e-9).any())
 
     def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
-        """Return the displacement (q, 3), m, of skin points (q, 3), and the normal force (N) for a
-        Young's modulus of 1 Pa.
+        """Return the displacement (q, 3), m, of q skin points, and the normal force on the finger.
 
-        depth_m: push depth, which must be one of the depths of the snapshot.
+        depth_m: push depth; only the depths of the precomputed solution are permitted.
+        points (q, 3): undeformed positions, m.
+
+        The force (N) is valid for a Young's modulus of 1 Pa. It must be multiplied by the true
+        modulus.
         """
         level = int(np.abs(self.snapshot.depths_m - depth_m).argmin())
         nodes, weights = self.locator.weights(points)
@@ -74,10 +77,11 @@ class ReferenceSolution:
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job (inputs) for pushes at a surface point on a mesh that is fine near it.
+    """Return the inputs of a Newton solution for pushes at a point, on a locally refined mesh.
 
-    ratio: distance between skin nodes near the point, in finger radii. If the shape does not
-    support such meshes, all touchable skin has this spacing.
+    ratio: distance between skin nodes near this point, in finger radii. If the shape does not
+        support locally refined meshes, all touchable skin has this spacing.
+    depths_m: push depths.
     """
     spacing = ratio * scene.finger.radius_m
     spec = body.spec.mesh
@@ -97,7 +101,11 @@ def make_focused_job(
 def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job (inputs) for pushes at a surface point on a mesh with even skin spacing."""
+    """Return the inputs of a Newton solution for pushes at a point, on a mesh of uniform spacing.
+
+    spacing_m: distance between skin nodes.
+    depths_m: push depths.
+    """
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
     return snapshots.make_job_on_mesh(
         mesh,
@@ -111,10 +119,12 @@ def make_even_job(
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:
-    """Load the solutions (snapshots) of jobs from the cache; compute and cache missing ones.
+    """Load push solutions (snapshots) from the cache; compute and cache the missing solutions.
 
-    on_progress: function that receives the number of finished jobs and the total number. Raises
-    OSError if a cache file cannot be read after it was written.
+    jobs: inputs of each solution.
+    on_progress: function that receives the number of finished jobs and the total number.
+
+    Raises OSError if a cache file cannot be read after it was written.
     """
     cache = CheckpointStore(cache_dir)
     names = [f"soft-body-push-{_digest(job)}" for job in jobs]

@@ -1,9 +1,9 @@
-"""Load the pushes (snapshots) of the coarse table that the package contains for some scenes.
+"""Load precomputed push solutions that the package contains for some scenes.
 
-For these scenes, no long computation is necessary before the coarse table is available. The files
-are in the folder `pushes`, and are named by the key of the table. The command `python -m
-benchmarks.ship_tables` writes them. The key changes if any input of the pushes changes, so an
-outdated file is not used.
+From these solutions (snapshots), the coarse nonlinear table of a scene is computed without delay.
+The files are in the folder `pushes`. The command `python -m benchmarks.ship_tables` writes them.
+The file name contains a key that depends on all inputs of the solutions. Therefore an outdated file
+is not used.
 """
 
 from __future__ import annotations
@@ -26,12 +26,18 @@ LEVELS = 32767
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path at which the package may contain a file with the snapshots of a table."""
+    """Return the path of the file with precomputed push solutions for a table.
+
+    The package contains this file only for some tables.
+    """
     return FOLDER / entry.path(FOLDER).name
 
 
 def load_shipped(path: Path) -> dict[str, Snapshot]:
-    """Load the snapshots in a file, by name. Return an empty dict if the file does not exist."""
+    """Load push solutions (snapshots) from a file, as a dict with their names as keys.
+
+    Returns an empty dict if the file does not exist.
+    """
     content = load_arrays(path)
     if content is None:
         return {}
@@ -51,7 +57,10 @@ def _decode(arrays: Mapping[str, NDArray[Any]]) -> Snapshot:
 
 
 def save_shipped(path: Path, snapshots: Mapping[str, Snapshot]) -> None:
-    """Write snapshots (by name) to a compressed file, with displacements rounded to 16 bits."""
+    """Write push solutions (snapshots) to a compressed file, with displacements rounded to 16 bits.
+
+    snapshots: solutions, with their names as keys.
+    """
     arrays: dict[str, NDArray[Any]] = {}
     for name, one in snapshots.items():
         scale_m = np.abs(one.moved).max(axis=(1, 2), initial=1e-9) / LEVELS

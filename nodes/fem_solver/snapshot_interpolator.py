@@ -80,7 +80,7 @@ def minimal_rotation(start: Floats, end: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class PlacedSnapshot:
-    """A snapshot together with its sample point and a search structure for its mesh."""
+    """A push solution (snapshot) with the pushed point and a search structure for its mesh."""
 
     sample: SamplePoint
     snapshot: Snapshot
@@ -88,7 +88,7 @@ class PlacedSnapshot:
 
 
 class SnapshotInterpolator:
-    """An interpolator of snapshots between sample points.
+    """An interpolator of push solutions (snapshots) between surface points.
 
     The interpolator shifts and rotates the displacement fields, and combines them with weights from
     moving least squares.
@@ -97,10 +97,11 @@ class SnapshotInterpolator:
     def __init__(
         self, solved: Sequence[PlacedSnapshot], towards_user: Floats, radius_m: float
     ) -> None:
-        """Store the solved snapshots, which must all have the same depths.
+        """Store the push solutions (snapshots), which must all have the same depths.
 
-        towards_user (3,): unit vector that is not opposite to any normal. radius_m: radius of the
-        finger.
+        towards_user (3,): unit vector towards the user. No surface normal at a pushed point may
+            point in the opposite direction.
+        radius_m: radius of the finger.
         """
         self._solved, self._user, self._radius = solved, towards_user, radius_m
         self._points = np.array([one.sample.point for one in solved])
@@ -109,12 +110,15 @@ class SnapshotInterpolator:
         self._rest: Floats | None = None
 
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats, float]:
-        """Interpolate the snapshots at a new sample point.
+        """Interpolate the stored push solutions (snapshots) to another surface point.
 
+        sample: this surface point and its normal.
         rest (s, 3): undeformed positions of the s skin nodes, m. Calls with the same array are
-        faster. Return the displacement (k, s, 3), m, and the force (k, 3), N, at k depths for a
-        Young's modulus of 1 Pa. The last result is the weighted mean number of depths at which the
-        snapshots converged.
+            faster.
+
+        Returns the displacement (k, s, 3), m, and the force (k, 3), N, at k depths for a Young's
+        modulus of 1 Pa. A third result is the number of depths at which the snapshots converged, as
+        a weighted mean over the snapshots.
         """
         if rest is not self._rest:
             self._rest, self._fixed = rest, {}
@@ -133,7 +137,7 @@ class SnapshotInterpolator:
         return moved, force, reached
 
     def neighbour_weights(self, sample: SamplePoint) -> list[tuple[int, float]]:
-        """Return indices and weights of the snapshots near a sample point.
+        """Return the indices and weights of the push solutions (snapshots) near a surface point.
 
         The weights add up to 1. Source: linear moving least squares over the surface (Lancaster &
         Salkauskas 1981).
@@ -179,7 +183,7 @@ class SnapshotInterpolator:
 
 
 def _evaluate(solved: PlacedSnapshot, points: Floats) -> Singles:
-    """Return the displacement (k, q, 3), m, of a snapshot at k depths.
+    """Return the displacement (k, q, 3), m, of a push solution (snapshot) at its k depths.
 
     The displacement is evaluated at the skin points nearest to `points` (q, 3).
     """
@@ -196,10 +200,13 @@ def _tangents(towards_user: Floats) -> list[int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SnapshotSet:
-    """The snapshots at sample points, from which a worker makes an interpolator.
+    """A set of push solutions (snapshots) that a worker process receives to make an interpolator.
 
-    mirrors: vectors (3,) of signs, one for each mirror symmetry of the body. towards_user (3,):
-    unit vector that is not opposite to any normal. radius_m: radius of the finger.
+    samples, solved: surface points of the pushes, and the solutions.
+    mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
+    towards_user (3,): unit vector towards the user. No surface normal at a sample may point in the
+        opposite direction.
+    radius_m: radius of the finger.
     """
 
     samples: Sequence[SamplePoint]
@@ -209,7 +216,7 @@ class SnapshotSet:
     radius_m: float
 
     def make_interpolator(self) -> SnapshotInterpolator:
-        """Make an interpolator from the snapshots and their mirror images."""
+        """Make an interpolator from the push solutions and their mirror images."""
         placed = place_snapshots(self.samples, self.solved, self.mirrors)
         return SnapshotInterpolator(placed, self.towards_user, self.radius_m)
 
@@ -217,7 +224,9 @@ class SnapshotSet:
 def place_snapshots(
     samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
 ) -> list[PlacedSnapshot]:
-    """Return the snapshots and their mirror images, without duplicates in planes of symmetry.
+    """Return push solutions (snapshots) and their mirror images.
+
+    If a pushed point is in a plane of symmetry, the mirror image in this plane is omitted.
 
     mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
     """

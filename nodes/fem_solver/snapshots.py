@@ -77,12 +77,16 @@ class SamplePoint:
 
 @dataclass(frozen=True, slots=True)
 class SnapshotJob:
-    """The inputs of a snapshot: pushes at one sample point to several depths.
+    """The inputs for computing a snapshot: the solutions of pushes at one point to several depths.
 
-    nodes (n, 3): positions of the n nodes, m. elements (e, 10): node indices. fixed (n,): whether
-    each node is fixed. faces (f, 6): six-node triangles that the finger can touch. depths_m: push
-    depths. mirror_axes: axes of the planes of symmetry at which the mesh ends, 0 for x = 0 and 1
-    for y = 0. These planes contain the sample point.
+    nodes (n, 3): positions of the n nodes, m.
+    elements (e, 10): node indices.
+    fixed (n,): whether each node is fixed.
+    faces (f, 6): six-node triangles that the finger can touch.
+    sample: surface point at which the finger pushes.
+    depths_m: push depths.
+    mirror_axes: normals of the planes of symmetry, 0 for the plane x = 0 and 1 for y = 0. Only one
+        side of these planes is meshed. The planes contain the pushed point.
     """
 
     nodes: Floats
@@ -289,11 +293,13 @@ def make_snapshot_job(
     spacing_m: float | None = None,
     depths_m: tuple[float, ...] | None = None,
 ) -> SnapshotJob:
-    """Return the job for the pushes at a sample point.
+    """Return the inputs for computing pushes at one surface point to several depths.
 
-    The job has a new mesh that is fine near the push if the shape supports such meshes. Otherwise,
-    it has the given mesh. spacing_m: skin spacing of the new mesh; if it is None,
-    the default for tables is used. depths_m: push depths; if it is None, `DEPTHS_M` is used.
+    If the shape permits it, a new mesh is made that is fine near this point and coarse elsewhere.
+    Otherwise, `mesh` is used.
+
+    spacing_m: node spacing on the skin of the new mesh; None means the default for tables.
+    depths_m: push depths; None means `DEPTHS_M`.
     """
     spacing_m = spacing_m or _spacing_m(spec, finger_radius_m)
     focused = _make_focused_mesh(spec, sample, spacing_m, NEAR_RATIO * finger_radius_m, None)
@@ -310,9 +316,10 @@ def make_snapshot_job(
 def make_fine_job(
     spec: MeshSpec, sample: SamplePoint, *, poisson_ratio: float, finger_radius_m: float
 ) -> SnapshotJob | None:
-    """Return the job for pushes on a fine mesh, whose forces correct those of the nonlinear table.
+    """Return the inputs for computing pushes at one surface point with an especially fine mesh.
 
-    Return None if the shape does not support meshes that are fine near one point.
+    The forces on this mesh correct the forces of the nonlinear table. Returns None if the shape
+    does not permit a mesh that is fine only near one point.
     """
     spacing_m = FINE_RATIO * _spacing_m(spec, finger_radius_m)
     near_m = FINE_NEAR_RATIO * finger_radius_m
@@ -334,7 +341,10 @@ def _spacing_m(spec: MeshSpec, finger_radius_m: float) -> float:
 
 
 def has_focused_meshes(spec: MeshSpec) -> bool:
-    """Return whether a body's shape and support permit meshes that are fine near only one point."""
+    """Return whether a body can have a mesh that is fine near one point and coarse elsewhere.
+
+    Cylinders permit such meshes only if a strip supports them. All other shapes permit them.
+    """
     return not isinstance(spec.geometry, Cylinder) or isinstance(spec.support, StripSupport)
 
 
@@ -375,9 +385,10 @@ def _make_focused_mesh(
 
 
 def _mirror_axes(spec: MeshSpec, sample: SamplePoint) -> tuple[int, ...]:
-    """Return the axes of the planes of symmetry of a cylinder that contain the sample point.
+    """Return the normals of the planes of symmetry of a cylinder that contain the pushed point.
 
-    Only the planes x = 0 and y = 0 are considered. For other shapes, the whole body is meshed.
+    The result contains 0 for the plane x = 0, and 1 for the plane y = 0. For other shapes, it is
+    empty.
     """
     if not isinstance(spec.geometry, Cylinder):
         return ()
@@ -395,9 +406,11 @@ def make_job_on_mesh(
     depths_m: tuple[float, ...],
     mirror_axes: tuple[int, ...] = (),
 ) -> SnapshotJob:
-    """Return the job for pushes at a sample point to several depths with a given mesh.
+    """Return the inputs for computing pushes at one surface point with a given mesh.
 
-    mirror_axes: axes of the planes of symmetry at which the mesh ends, 0 for x = 0 and 1 for y = 0.
+    depths_m: push depths.
+    mirror_axes: normals of the planes of symmetry, 0 for the plane x = 0 and 1 for y = 0. The mesh
+        must be on only one side of these planes.
     """
     return SnapshotJob(
         nodes=mesh.nodes,

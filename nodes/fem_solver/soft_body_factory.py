@@ -35,12 +35,14 @@ def choose_method(
     *,
     compute_table: bool = False,
 ) -> tuple[MethodChoice, float]:
-    """Choose the method and the skin spacing (m) from a scene and the parameters of a node.
+    """Choose the solution method and the skin spacing (m) of a soft body.
 
-    method, skin_spacing_m: parameters of the node. `auto` selects the value in the scene. If the
-    scene selects the linear method, this method is used even if a table is cached. Otherwise,
-    `auto` selects a cached table. compute_table: whether a missing table is computed if the method
-    is `auto`.
+    method: parameter of the node. If it is `auto` and the scene selects the linear method, the
+        result is `linear`. Otherwise, `auto` remains `auto`, which means: use a table if one is
+        cached.
+    skin_spacing_m: parameter of the node; `auto` means the value in the scene.
+    compute_table: whether the result is `nonlinear_table` instead of `auto`, so that a missing
+        table is computed.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
@@ -73,8 +75,8 @@ class SoftBodyFactory:
     ) -> list[body.SceneBody]:
         """Build the soft body of a scene for each available method, starting with the best method.
 
-        Raises UnfitMeshError if the object cannot be meshed, ValueError if the material, a size or
-        a depth is invalid, and MemoryError if the free memory is insufficient.
+        Raises UnfitMeshError if the object cannot be meshed, and MemoryError if the free memory is
+        insufficient. Raises ValueError if the material, a size or a depth is invalid.
         """
         spec = body.make_soft_body_spec(
             scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0
@@ -119,7 +121,7 @@ class SoftBodyFactory:
     ) -> str:
         """Return a note for the user if the scene's nonlinear table is missing, or an empty text.
 
-        made: soft bodies that `bodies` has built for the scene.
+        made: soft bodies that were built for the scene, one for each available method.
         """
         choice = scene.methods.soft_body
         waits_for_table = (

@@ -84,10 +84,12 @@ def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FillJob:
-    """The job (inputs) of a worker process that interpolates snapshots at some contact nodes.
+    """The inputs of a worker process that interpolates push solutions at some contact nodes.
 
-    samples: contact nodes. rest (s, 3): undeformed positions of the s skin nodes, m. triangles (t,
-    3): skin triangles. source: snapshots that are interpolated.
+    samples: contact nodes.
+    rest (s, 3): undeformed positions of the s skin nodes, m.
+    triangles (t, 3): skin triangles.
+    source: push solutions (snapshots) at other surface points.
     """
 
     samples: Sequence[SamplePoint]
@@ -98,11 +100,13 @@ class FillJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilledNodes:
-    """The interpolated snapshots at n nodes and k depths.
+    """The interpolated push solutions at n contact nodes and k depths.
 
-    moved (n, k, 3s): displacements of s skin nodes, m. force_n (n, k, 3): forces, N. reached (n,):
-    mean number of depths at which the used snapshots converged. valid (n,): number of depths at
-    which the displacement is valid.
+    moved (n, k, 3s): displacements of s skin nodes, m.
+    force_n (n, k, 3): forces, N.
+    reached (n,): number of depths at which Newton's method converged, as a weighted mean over the
+        interpolated solutions.
+    valid (n,): number of depths at which the displacement is valid.
     """
 
     moved: Singles
@@ -112,7 +116,7 @@ class FilledNodes:
 
 
 def interpolate_nodes(job: FillJob) -> FilledNodes:
-    """Interpolate the solved pushes (snapshots) at each skin node of a job that can be touched."""
+    """Interpolate push solutions (snapshots) at the contact nodes of one job."""
     interpolator = job.source.make_interpolator()
     moved, force, reached = zip(
         *(interpolator.interpolate(sample, job.rest) for sample in job.samples), strict=True
@@ -138,13 +142,16 @@ def fill_table(
         interpolate_nodes, jobs
     ),
 ) -> Table:
-    """Compute the nonlinear table of a body from snapshots.
+    """Compute a soft body's nonlinear table of push responses from push solutions (snapshots).
 
-    triangles (t, 3): triangles of the skin. linear: linear method for the same response and a
-    modulus of 1 Pa. Its linear range must contain the depths `BLEND_M`. fine: sample point and
-    snapshot of a push on a fine mesh, with which all forces are corrected; None if the forces are
-    not corrected. interpolate: function that interpolates the snapshots at the nodes of jobs, and
-    returns the results in the order of the jobs.
+    triangles (t, 3): triangles of the skin.
+    linear: linear soft body with the same response and a modulus of 1 Pa. Its linear range must
+        include the depths `BLEND_M`, between which the table changes to the snapshots.
+    source: snapshots at several surface points.
+    fine: surface point and solution of a push on a finer mesh, from which force corrections are
+        computed; None for no corrections.
+    interpolate: function that executes the interpolation jobs, and returns their results in the
+        same order.
     """
     interpolator = source.make_interpolator()
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
@@ -229,15 +236,16 @@ def compute_force_factors(
 ) -> Floats:
     """Return the factors (L,) that correct the forces of a table at the L depths (L,), m.
 
-    The meshes of the table are too coarse for small contacts, so its forces are too large. Each
-    factor is an estimate of the true force divided by the force in the table at the same point. At
-    depths of at least `BLEND_M[1]`, the estimate is the Richardson extrapolation of order 2 from
-    the table's mesh and a fine mesh. At smaller depths, it is the force on the fine mesh. Beyond
-    the maximum depth that was solved on the fine mesh, the factor is constant.
-
-    fine: sample point of a push, and the snapshot (solution) of this push on the fine mesh.
+    fine: surface point and solution of a push on a fine mesh.
     response, linear: response of the skin, and linear model of the soft body.
-    interpolator: interpolator of the snapshots on the table's mesh.
+    interpolator: interpolator of the push solutions from which the table is computed.
+
+    The meshes of the table are too coarse for small contacts, so the forces in the table are too
+    large. Each factor is an estimate of the true force divided by the force in the table at the
+    same point. At depths of at least `BLEND_M[1]`, the estimate is a Richardson extrapolation of
+    order 2 from the table's mesh and the fine mesh. At smaller depths, the estimate is the force on
+    the fine mesh. Beyond the maximum depth that was solved on the fine mesh, the factor is
+    constant.
     """
     sample, push = fine
     solved_m = push.depths_m[: push.reached]
@@ -261,11 +269,14 @@ def compute_force_factors(
 def _blend_levels(
     sample: SamplePoint, linear: LinearSoftBody, depths: Floats, solved: Singles, pushed: Floats
 ) -> tuple[Singles, Floats]:
-    """Blend interpolated snapshots with the linear response at small depths.
+    """Blend interpolated push solutions with the linear response at small depths.
 
-    solved (k, 3s): interpolated displacement (m) of the s skin nodes at the last k of the L depths.
-    pushed (k, 3): interpolated force (N) at these k depths. Return the displacement (L, 3s) and the
-    force (L, 3) at all depths.
+    depths (L,): all depths of the table, m. The push solutions contain only the last k of them.
+    solved (k, 3s), pushed (k, 3): displacement (m) of the s skin nodes, and force (N), from the
+        push solutions.
+
+    Returns the displacement (L, 3s) and the force (L, 3) at all depths. The weight of the push
+    solutions increases from 0 to 1 between the two depths `BLEND_M`.
     """
     moved = np.zeros((len(depths), solved.shape[1]), dtype=np.float32)
     force = np.zeros((len(depths), 3))
@@ -373,9 +384,10 @@ class TableSoftBody:
     ) -> None:
         """Precompute the force curves of all contact nodes.
 
-        bounds (b, 3): positions (m) of the b skin nodes that must not be touched. name: name of the
-        method in messages. push_depth_m: depth at which the force curve ends. linear_depth_m: depth
-        at which the stiffness is evaluated.
+        bounds (b, 3): positions (m) of the b skin nodes that the finger cannot touch.
+        name: name of the method in messages.
+        push_depth_m: depth at which the force curve ends.
+        linear_depth_m: depth at which the stiffness is evaluated.
         """
         self.name = name
         from scipy.linalg.blas import sgemv
@@ -479,9 +491,11 @@ class TableSoftBody:
         return self._curve_at(nodes, weights)
 
     def _curve_at(self, nodes: Ints, weights: Floats) -> Floats:
-        """Return the force curve (n, 2) of a skin point, interpolated between nodes.
+        """Return the force-depth curve (n, 2), m and N, of a skin point.
 
-        The running maximum is used, because negative weights could let the force fall with depth.
+        The curve is interpolated between the mesh nodes. Interpolation weights can be negative, so
+        the interpolated force could decrease with depth. The curve is therefore replaced by its
+        running maximum.
         """
         result = np.empty((len(self._depths), 2))
         result[:, 0] = self._depths

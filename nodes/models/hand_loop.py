@@ -171,9 +171,10 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rate (k,), 1/s, of the slowest mode for each of k slopes (k,).
+    """Return the decay rates (k,), 1/s, of the slowest mode of the control loop for k slopes (k,).
 
-    A negative rate means that the mode grows.
+    A slope is the offset of the sheet along its normal, divided by the finger's depth. A negative
+    rate means that the mode grows.
     """
     matrices = make_loop_matrices(
         hand, loop, sheet_stiffness_n_per_m=sheet_stiffness_n_per_m, slopes=slopes
@@ -190,12 +191,16 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the smallest magnitude, up to `max_slope`, of a slope with an unstable control loop.
+    """Return the slope at which the control loop of sheet and hand becomes unstable.
 
-    towards_finger: whether the slopes are negative, so that the sheet moves towards the finger.
+    The slope is the offset of the sheet along its normal, divided by the finger's depth. The result
+    is the smallest magnitude of an unstable slope, and is at most `max_slope`.
 
-    The decay rate is interpolated between slopes on a grid. Slopes above the result are not
-    evaluated, even if the loop is stable at some of them.
+    towards_finger: whether to search the negative slopes, at which the sheet moves towards the
+        finger.
+
+    The decay rate of the slowest mode is interpolated between slopes on a grid. Slopes above the
+    result are not evaluated, even if the loop is stable at some of them.
     """
     magnitudes = np.concatenate([[0.0], np.geomspace(0.01 * max_slope, max_slope, SLOPES)])
     decays = compute_decays_per_s(
@@ -216,11 +221,13 @@ def compute_critical_slope(
 
 @dataclass(frozen=True, slots=True)
 class OffsetBounds:
-    """The maximum slopes (sheet offset divided by finger depth) at which every hand is stable.
+    """The maximum slopes at which the control loop of the sheet is stable with every hand.
 
-    bandwidths_rad_per_s (f,): bandwidths of the depth filter, ascending.
+    The slope is the offset of the sheet along its normal, divided by the finger's depth.
+
+    bandwidths_rad_per_s (f,): bandwidths of the filter of the measured depth, ascending.
     sheet_stiffnesses_n_per_m (k,): stiffnesses of the sheet under the finger.
-    max_advances, max_retreats (f, k): maximum slopes towards the finger and away from it.
+    max_advances, max_retreats (f, k): maximum slopes of motion towards the finger and away from it.
     """
 
     bandwidths_rad_per_s: Floats
@@ -229,14 +236,18 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum stable slopes (n,) of an advance (motion towards the finger).
+        """Return the maximum stable slopes (n,) of sheet motion towards the finger.
+
+        A slope is the offset of the sheet along its normal, divided by the finger's depth.
 
         stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum stable slopes (n,) of a retreat (motion away from the finger).
+        """Return the maximum stable slopes (n,) of sheet motion away from the finger.
+
+        A slope is the offset of the sheet along its normal, divided by the finger's depth.
 
         stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
@@ -253,10 +264,15 @@ class OffsetBounds:
 
 @dataclass(frozen=True, slots=True)
 class OffsetBoundsTable:
-    """A table of `OffsetBounds` over the delays (d,) of the control loop, for one camera period.
+    """A table of the maximum stable slopes (`OffsetBounds`) for d delays of the control loop.
 
-    The arrays of slopes have the shape (d, f, k) for d delays, f bandwidths and k sheet
-    stiffnesses.
+    The slope is the offset of the sheet along its normal, divided by the finger's depth. The table
+    is valid for one camera period.
+
+    delays_s (d,): delays from the measurement of a depth to the motion of the sheet.
+    bandwidths_rad_per_s (f,): bandwidths of the filter of the measured depth.
+    sheet_stiffnesses_n_per_m (k,): stiffnesses of the sheet under the finger.
+    max_advances, max_retreats (d, f, k): maximum slopes towards the finger and away from it.
     """
 
     delays_s: Floats
@@ -266,7 +282,7 @@ class OffsetBoundsTable:
     max_retreats: Floats
 
     def at_delay(self, delay_s: float) -> OffsetBounds:
-        """Return the bounds at the smallest delay in the table that is at least `delay_s`.
+        """Return the stability bounds for the smallest delay in the table of at least `delay_s`.
 
         The bounds are 0 if all delays of the table are smaller.
         """
@@ -279,13 +295,18 @@ class OffsetBoundsTable:
 
 
 def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
-    """Compute the maximum slopes at which the control loop is stable for all hands.
+    """Compute the maximum slopes at which the control loop of the sheet is stable with all hands.
 
-    advance_limit: upper limit of the slopes towards the finger.
+    The slope is the offset of the sheet along its normal, divided by the finger's depth. In an
+    advance, the sheet moves towards the finger. In a retreat, it moves away.
 
-    The loop must be stable even if its gain and delay are larger by the margins. For an advance,
-    the critical slope is divided by the gain margin. For a retreat, the sheet's stiffness is
-    multiplied by the gain margin instead, because a retreat slope cannot exceed 1.
+    period_s: period of the camera.
+    advance_limit: upper limit of the slopes of an advance.
+
+    The loop must be stable even if its delay is larger by `DELAY_MARGIN_S` and its gain by the
+    factor `GAIN_MARGIN`. For an advance, the critical slope is divided by the gain margin. A
+    retreat slope cannot exceed 1, so for a retreat the sheet's stiffness is multiplied by the gain
+    margin instead.
     """
     shape = len(DELAYS_S), len(BANDWIDTHS_RAD_PER_S), len(SHEET_STIFFNESSES_N_PER_M)
     advances, retreats = np.empty(shape), np.empty(shape)
@@ -324,9 +345,9 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
 
 
 def _descend(slopes: Floats) -> Floats:
-    """Reduce slopes so that they never increase with the delay or the stiffness.
+    """Reduce stability bounds so that they never increase with the delay or the sheet's stiffness.
 
-    slopes (d, f, k): slopes for d delays, f bandwidths and k stiffnesses.
+    slopes (d, f, k): maximum stable slopes for d delays, f bandwidths and k stiffnesses.
     """
     result = np.minimum.accumulate(np.minimum.accumulate(slopes, axis=0), axis=2)
     return np.asarray(result)

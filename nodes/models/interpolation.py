@@ -1,6 +1,6 @@
 """Interpolate between two values, and between the points of predicted paths.
 
-The points of a path with the time step s are at the times 0, s, 2 s, ... after its start.
+The points of a path are at equal time intervals. The first point is at the time 0.
 """
 
 from __future__ import annotations

@@ -18,8 +18,9 @@ difference is smaller, the scene's period is used."""
 class MeasuredPeriod:
     """An estimator of the period of messages that are published once per camera image.
 
-    scene_period_s: camera period in the scene, s. This period is used until enough messages have
-        been added, and as long as the measured period is close.
+    scene_period_s: camera period in the scene, s. The estimator returns this period until enough
+        messages have been added. It also returns this period if the measured period is nearly the
+        same.
     """
 
     def __init__(self, scene_period_s: float) -> None:

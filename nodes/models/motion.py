@@ -47,12 +47,13 @@ def follow(
     max_acceleration: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return displacement (n,) and velocity (n,) of a point after a step to a moving target.
+    """Compute one step of a point that follows a moving target with limited acceleration.
+
+    Returns the displacement (n,) of the point in this step, and its velocity (n,) afterwards.
 
     error (n,): target at the end of the step minus the current point.
     velocity, target_velocity (n,): current velocities of the point and of the target.
-    max_acceleration: maximum change of the mean velocity from one step to the next, divided by
-        `step_s`.
+    max_acceleration: limit of the change of the velocity between two steps, divided by `step_s`.
     """
     target_velocity = _clamp_length(target_velocity, max_speed)
     desired = desired_velocity(
@@ -80,7 +81,10 @@ def desired_velocity(
     max_acceleration: float,
     step_s: float,
 ) -> Floats:
-    """Return the fastest velocity (n,) towards a moving target from which the point can stop there.
+    """Return the fastest velocity (n,) at which a point can approach a moving target.
+
+    With the available deceleration, the point must be able to reach the target at the target's
+    velocity.
 
     error (n,): target at the end of the step minus the current point, in any unit u. Velocities
         have the unit u/s.
@@ -132,19 +136,22 @@ class SheetBounds:
 
 @dataclass(frozen=True, slots=True)
 class EdgeBound:
-    """The maximum speed of any point on the sheet's clamped edges.
+    """A limit on the speed of all points of the sheet's clamped edges.
 
     reach_m: half the length of an edge.
 
-    Translation and rotation are scaled by the same factor. If each arm limited the speed of its
-    edge separately, the distance between the edges would change.
+    The sheet's translation and rotation are scaled by the same factor if the limit is exceeded. If
+    each arm limited the speed of its edge separately, the distance between the edges would change.
     """
 
     speed_m_per_s: float
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0 to 1) for both speeds that keeps the edges within their limit."""
+        """Return the factor (0 to 1) for the sheet's linear and angular speed.
+
+        With this factor, no point of the clamped edges exceeds the maximum speed.
+        """
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 

@@ -152,7 +152,7 @@ def apply(a_from_b: Floats, points_b: Floats) -> Floats:
 
 
 def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
-    """Return whether a matrix is a finite rigid transform (4, 4) with the last row (0 0 0 1).
+    """Return whether a matrix (4, 4) is a finite rigid transform with the last row (0 0 0 1).
 
     tolerance: maximum magnitude of the dot product of two different rows of the rotation matrix.
     """

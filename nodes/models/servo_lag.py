@@ -88,15 +88,16 @@ class LagBounds:
 
 @dataclass(frozen=True, slots=True)
 class LagEstimate:
-    """An estimated lag (s) of an arm with its standard deviation (s).
+    """An estimated lag (s) of an arm, and its standard deviation (s).
 
-    tracking_error_rad: standard deviation of measured joint angles minus commanded joint angles
-        delayed by the lag, as the norm over the joints.
+    tracking_error_rad: difference between measured joint angles and commanded joint angles that are
+        delayed by the lag. The value is the standard deviation of each joint, combined as the norm
+        over the joints.
     expected_error_rad: tracking error of a critically damped servo with this lag and motion.
     answer_delay_s: mean time from a command to the measurement.
     command_interval_s: mean interval between commands.
 
-    Both means are weighted by the squared speed, as fast motion contains more information.
+    Both means are weighted by the squared speed, because fast motion determines the lag better.
     """
 
     lag_s: float
@@ -182,12 +183,13 @@ class ServoLagEstimator:
         self.lag_s = self._bounds.clip(self.lag_s + min(max(change_s, -limit_s), limit_s))
 
     def _add(self, measured: Floats, wanted_s: Floats, timing_s: Floats, step_s: float) -> None:
-        """Add one measurement to the weighted means and variances of all lags.
+        """Add one measurement to the weighted means and variances of the error for all lags.
 
         measured (6,): measured joint angles, rad.
-        wanted_s: times of the commands with which the angles are compared, one for each lag.
+        wanted_s: measurement time minus each lag. The error is the measured angles minus the angles
+            that were commanded at these times.
         timing_s (2,): answer delay and command interval, s.
-        step_s: weight of the measurement.
+        step_s: time since the last measurement, which is the weight of this measurement.
         """
         times, joints = self._times_s[: self._count], self._joints[: self._count]
         # For times after the newest command, that command is used.
@@ -258,7 +260,11 @@ def _are_joints(joints_rad: Floats) -> bool:
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Return a mean (6,) and a total variance, updated by a value (6,) of the weight `gain`."""
+    """Update a running mean (6,) and a variance with a new value (6,), and return both.
+
+    square: sum of the variances of the six components.
+    gain: weight of the new value, from 0 to 1.
+    """
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square

@@ -142,10 +142,12 @@ class ObjectCurve:
 
 @dataclass(frozen=True, slots=True)
 class StretchLimits:
-    """The limits of the sheet's stretch, edge force and offset.
+    """The limits of the sheet's stretch, edge force and normal offset.
 
     edge_force_n: maximum force on each clamp.
-    bounds: bounds on the slope of the offset; None if no hand is considered.
+    bounds: limits of the derivative of the offset with respect to the finger's depth. Within these
+        limits, the control loop with the user's hand is stable. None means that the hand is
+        ignored.
     """
 
     min_stretch_ratio: float
@@ -169,12 +171,14 @@ class StretchLimits:
 def make_stretch_limits(
     sheet: SheetSpec, model: SheetForceModel, bounds: OffsetBounds | None = None
 ) -> StretchLimits:
-    """Return the stretch limits: the fraction USABLE_FRACTION of the scene's limits.
+    """Compute the limits of stretch and edge force from the limits in the scene.
 
-    bounds: bounds on the slope of the offset that keep the control loop of sheet and hand stable.
+    They are a fraction USABLE_FRACTION of the scene's limits. The maximum stretch also keeps the
+    edge force within its limit while nothing touches the sheet. A push increases the edge force
+    further. The function `render_force` limits this increase.
 
-    The maximum stretch keeps the edge force within its limit while nothing touches the sheet.
-    `render_force` limits the additional edge force of a push.
+    bounds: stable range of the derivative of the sheet's normal offset with respect to the finger's
+        depth; None if the user's hand is ignored.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -197,10 +201,14 @@ def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class RenderedForce:
-    """The deflections and forces of the sheet at n depths, for one stretch and one position.
+    """The deflections and forces of the sheet at n finger depths.
 
-    indentation_m: deflection of the sheet under the finger, which corresponds to an indentation of
-        the object.
+    They are valid for one stretch of the sheet and one position of the push.
+
+    depths_m: depth of the finger below the undeformed surface of the object.
+    object_force_n, force_n: force of the virtual object, and force of the sheet on the finger.
+    indentation_m: deflection of the sheet under the finger. It is the depth minus the sheet's
+        normal offset.
     edge_force_n: force on each clamp.
     advance_per_depth: maximum advance of the sheet towards the finger, divided by the depth.
     force_limited: whether the limit of the edge force has reduced the indentation.
@@ -217,7 +225,7 @@ class RenderedForce:
 
     @property
     def normal_offset_m(self) -> Floats:
-        """Return the sheet's offsets (n,), m, behind the object's tangent plane."""
+        """Return the sheet's offset (n,), m, behind the object's tangent plane at each depth."""
         return self.depths_m - self.indentation_m
 
     @property
@@ -255,13 +263,14 @@ def render_force(
     *,
     max_depth_m: float,
 ) -> RenderedForce:
-    """Compute the sheet's indentations at which its force is closest to the object's force.
+    """Compute the sheet's indentations at which the sheet's force is closest to the object's force.
 
     push: stretch ratio, finger radius and position of the push.
     max_depth_m: maximum depth of the finger in the object.
 
-    The limit of the edge force limits the indentation. If the depth increases by d, the indentation
-    increases by at most (1 + `limits.max_advance`) * d.
+    The indentations are limited so that the force on the clamped edges does not exceed its limit.
+    If the finger's depth increases by d, the indentation increases by at most (1 +
+    `limits.max_advance`) * d.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
@@ -307,12 +316,13 @@ def _indentation_for_edge_force(
 
 
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
-    """Reduce the sheet's advance smoothly to zero at small depths and small contact forces.
+    """Suppress the sheet's advance towards the finger at small depths and small contact forces.
 
-    depths, indentation: n depths and indentations (n,), m.
+    depths: n depths (n,) of the finger in the object, m.
+    indentation: indentations (n,) of the sheet, m. The advance is the indentation minus the depth.
     forces_n: contact forces (n,) at these depths.
 
-    Returns the changed indentations (n,), m.
+    Returns the reduced indentations (n,), m. The advance increases smoothly from zero.
     """
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
     depth_weight = _fade(depths, DEADBAND_START_M, DEADBAND_END_M)
@@ -336,11 +346,14 @@ def _saturate(indentation: Floats, maximum: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """The offset of the sheet as a function of the depth in one object, at a constant stretch.
+    """The sheet's offset and indentation as functions of the depth in one object.
+
+    The offset is the distance of the sheet behind the object's tangent plane. The indentation is
+    the depth minus the offset. The stretch is constant.
 
     note: text about forces that the sheet cannot render; empty if the sheet can render all forces.
-    centre: rendered forces of a push at the sheet's centre.
-    _nodes: |x| and |y| (m) of the positions on the sheet at which the offset was computed.
+    centre: forces that the sheet renders if its centre is pushed.
+    _nodes: |x| and |y| (m) of the positions on the sheet at which the indentation was computed.
     _indentation, _growth: indentation at these positions as a function of depth, and its
         derivative.
     """
@@ -384,7 +397,11 @@ class Compliance:
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the derivative of the normal offset with respect to the depth; it is at most 1."""
+        """Return the derivative of the sheet's normal offset with respect to the finger's depth.
+
+        The normal offset is the distance of the sheet behind the object's tangent plane. The
+        derivative is at most 1.
+        """
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:
@@ -394,9 +411,10 @@ class Compliance:
     def choose_bandwidth_rad_per_s(self) -> tuple[float, bool]:
         """Choose the bandwidth (rad/s) of the depth filter, and return whether the loop is stable.
 
-        The result is the largest bandwidth at which the slopes of the offset are within their
-        bounds. If there is none, the smallest bandwidth is chosen. Without bounds, the bandwidth is
-        infinite.
+        The control loop with the hand is stable if the derivative of the sheet's offset with
+        respect to the depth is within bounds. The bounds depend on the bandwidth. The result is the
+        largest stable bandwidth, or the smallest bandwidth if none is stable. Without bounds, the
+        bandwidth is infinite.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:
@@ -567,12 +585,10 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 
 
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, str]:
-    """Return the stretch that renders an object's stiffness at small pushes without an offset.
+    """Return the stretch at which the sheet's stiffness at small deflections matches the object's.
 
-    The second result is a text about a stiffness that the sheet cannot render. It is empty if the
-    sheet can render the stiffness.
-
-    The sheet is modelled as linear, and the fingertip as a point.
+    The second result is a note. It is empty unless the object is softer or stiffer than the sheet
+    can be. The sheet is modelled as linear, and the fingertip as a point.
     """
     least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(

@@ -39,13 +39,14 @@ COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 class ComplianceController:
     """A controller of the sheet's stretch and normal offset for the object under the finger.
 
-    mode: "force_curve" renders the object's force as a function of depth. "stiffness" renders the
-        object's stiffness at small pushes by the stretch (Furukawa et al. 2007). "constant_stretch"
-        uses the minimum stretch.
+    mode: "force_curve" renders the object's force as a function of depth. "stiffness" matches only
+        the object's stiffness at small depths, by the stretch (Furukawa et al. 2007).
+        "constant_stretch" uses the minimum stretch.
     hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle. None means
         that the value in the scene is used.
-    bounds: bounds on the offset's slope that keep the control loop with the hand stable; None if no
-        hand is considered.
+    bounds: limits of the derivative of the offset with respect to the finger's depth. Within these
+        limits, the control loop with the user's hand is stable. None means that the hand is
+        ignored.
     delay_s: time from the measurement of a depth until the sheet has moved.
     bandwidth_rad_per_s: bandwidth of the depth filter; None if there are no bounds.
     """
@@ -76,11 +77,11 @@ class ComplianceController:
         self._compliance: Compliance | None = None
 
     def update(self, soft_body: SoftBody, *, in_contact: bool) -> None:
-        """Fit the stretch and the offset of the sheet to the soft body under the finger.
+        """Choose the sheet's stretch and normal offset to match the force of the soft body.
 
         The stretch remains constant during contact, because users would feel the motion of the
-        edges. If the force curve is invalid, the method raises UnfitCurveError and keeps the last
-        fit.
+        edges. If the force curve is invalid, the method raises UnfitCurveError, and the last values
+        remain valid.
         """
         if self._mode == "constant_stretch":
             return
@@ -104,8 +105,9 @@ class ComplianceController:
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
         """Set the delay from the measurement of a depth to the motion of the sheet.
 
-        If the new delay changes the stability bounds of the offset, stretch and offset are fitted
-        to the object's force curve again. They are not fitted while the finger touches the sheet.
+        The stability bounds of the sheet's offset depend on this delay. If the bounds change, the
+        stretch and the offset are computed again from the object's force curve. While the finger
+        touches the sheet, the bounds are not changed.
         """
         self.delay_s = delay_s
         if self._bounds is None or in_contact:

@@ -229,8 +229,8 @@ class ContactStateMachine:
     ) -> tuple[SheetContact, SheetReason | None]:
         """Roll the sheet on the object until the contact is at the surface point `found`.
 
-        The contact stays within the usable area of the sheet. The second result is the limit that
-        stops the contact before this point, or None if no limit does.
+        The contact must stay within the usable area of the sheet. Returns the new contact, and the
+        limit at which the rolling stopped, or None if `found` was reached.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
@@ -246,7 +246,11 @@ class ContactStateMachine:
         return rolled, "past_sheet_width" if axis == 0 else "past_sheet_height"
 
     def _lift(self, contact: SheetContact) -> SheetContact:
-        """Return the contact with the sheet lifted above a concave surface around the contact."""
+        """Return a copy of a contact in which the sheet does not cut into a concave surface.
+
+        At a concave point, the surrounding surface rises above the tangent plane. The sheet is
+        lifted from this plane by the height of the surrounding surface.
+        """
         lift_m = self._shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
         return replace(contact, lift_m=lift_m)
 

@@ -19,7 +19,11 @@ VERSION = 2
 
 
 def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
-    """Define the key and the format of the cache file with the bounds for a camera's frame rate."""
+    """Define the cache file that contains the stability bounds of the sheet's offset.
+
+    The bounds ensure that the control loop of the sheet and the user's hand is stable. They depend
+    on the camera's frame rate.
+    """
     depends_on = {
         "version": VERSION,
         "rate_hz": rate_hz,
@@ -39,7 +43,10 @@ def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
 def load_or_compute_bounds(
     rate_hz: float, cache_dir: Path | None, progress: Callable[[str], None] = lambda text: None
 ) -> OffsetBoundsTable:
-    """Return the bounds for a camera's frame rate from the cache, or compute and store the bounds.
+    """Return the stability bounds of the sheet's offset for a camera's frame rate.
+
+    The bounds ensure that the control loop of the sheet and the user's hand is stable. They are
+    loaded from the cache if possible.
 
     progress: function that receives a text before the computation.
     """

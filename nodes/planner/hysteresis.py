@@ -18,9 +18,9 @@ were smaller, tremor would reverse the hysteresis at small depths."""
 
 
 class HysteresisCorrection:
-    """A model of the ratio of the sheet's force to its elastic force.
+    """A model of the sheet's hysteresis: the ratio of the actual force to the elastic force.
 
-    ratio: fraction of the loading energy that is lost in a cycle.
+    ratio: fraction of the loading energy that the rubber loses in a cycle.
     """
 
     def __init__(self, ratio: float) -> None:
@@ -28,7 +28,11 @@ class HysteresisCorrection:
         self._depth_m, self._direction = 0.0, 1.0
 
     def update(self, depth_m: float) -> float:
-        """Update the model with a new finger depth (m); return the force over the elastic force."""
+        """Update the model with a new finger depth (m), and return the force ratio.
+
+        The ratio is the actual force divided by the elastic force. It is above 1 while the depth
+        increases, and below 1 while the depth decreases.
+        """
         if depth_m <= 0.0:
             self._depth_m, self._direction = 0.0, 1.0
             return 1.0

@@ -1,4 +1,4 @@
-"""Detect oscillations of the finger that the sheet's motion drives, and stop this motion."""
+"""Detect finger oscillations that the moving sheet causes, and stop the motion of the sheet."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class OscillationWatchdog:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all measurements, and set the weight of the offset's motion to 1."""
+        """Discard all measurements, and allow the full motion of the sheet's offset again."""
         self.weight = 1.0
         self._slow: tuple[float, float] | None = None
         self._last = (0.0, 0.0)
@@ -56,9 +56,12 @@ class OscillationWatchdog:
         self._fading = False
 
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
-        """Process a new measurement, and return the weight (0 to 1) of the offset's motion.
+        """Process a new measurement, and return the factor by which the offset's motion is scaled.
 
-        depth_m: measured depth.
+        The factor is 1 in normal operation. If the sheet's motion drives an oscillation of the
+        finger, the factor decreases to 0.
+
+        depth_m: measured depth of the finger.
         offset_m: offset of the sheet at the time of the measurement.
         step_s: time since the last measurement.
         """
@@ -101,10 +104,12 @@ class OscillationWatchdog:
 
 
 def _oscillates(depths: np.ndarray) -> bool:
-    """Return whether n depths (n,), m, change their sign at least twice.
+    """Return whether the deviation of the finger's depth from its slow mean oscillates.
 
-    The depths of a single push change their sign less often. Values smaller than MIN_AMPLITUDE_M
-    are ignored.
+    depths: n deviations (n,), m.
+
+    An oscillation changes its sign at least twice. A single push changes its sign less often.
+    Values smaller than MIN_AMPLITUDE_M are ignored.
     """
     large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
     return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

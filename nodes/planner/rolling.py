@@ -77,12 +77,12 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 
 
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
-    """Return the contact after the sheet has rolled to the surface point `found`.
+    """Return the contact after the sheet has rolled without slip to the surface point `found`.
 
-    The displacement of the contact on the sheet follows from the chord between both points. The
-    chord is projected onto the plane halfway between the tangent planes, and scaled to the length
-    of the arc. The displacement is exact on circles. On other curves, the error is of third order
-    in the angle.
+    The distance on the sheet is the length of a circular arc through both points. Its direction is
+    the direction of the chord, projected onto the plane halfway between the tangent planes. The
+    result is exact on circles. On other curves, the error is of third order in the angle between
+    the normals.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
@@ -106,8 +106,8 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
     home: axes (3, 3) of the sheet before they are rotated to the surface normal.
     half_width_m: maximum distance of the contact from the sheet's centre.
 
-    The contact is on the sheet's horizontal centre line. Within the maximum distance, the sheet's
-    centre is aligned with the object's origin along the sheet's x axis.
+    The contact is on the sheet's horizontal centre line. Along this line, the sheet's centre is as
+    close as possible to the object's origin.
     """
     axes = transport_axes(home, found.normal)
     x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
@@ -115,12 +115,13 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 
 
 def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
-    """Return the twist (6,) of the rolling sheet's centre for a given velocity of the contact.
+    """Return the twist (6,) of the sheet's centre while the sheet rolls on the object without slip.
 
-    rate: velocity (3,) m/s of the contact on the object.
+    rate: velocity (3,) m/s at which the contact point moves on the object.
 
     The twist consists of linear velocity (m/s) and angular velocity (rad/s). The angular velocity
-    is n x dn/dt with the surface normal n. The point of the sheet in contact is at rest.
+    is n x dn/dt with the surface normal n. The material point of the sheet at the contact is at
+    rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)
@@ -137,8 +138,9 @@ def compute_tangent_twist(
     rate: velocity (3,) m/s of the surface point.
     home, half_width_m: as in `make_tangent_contact`.
 
-    With the surface normal n and the third axis h of `home`, the angular velocity of the sheet is n
-    x dn/dt plus -(h x n) . dn/dt / (1 + h . n) about the normal.
+    The angular velocity is n x dn/dt + s n. The first term rotates the surface normal n. The second
+    term is a spin about the normal with the rate s = -(h x n) . dn/dt / (1 + h . n). Here h is the
+    third axis of `home`.
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
     tangential = rate - normal * (rate @ normal)
@@ -164,10 +166,11 @@ def cross(a: Floats, b: Floats) -> Floats:
 
 
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
-    """Return the angle (rad) by which `axes` (3, 3) are rotated about their normal.
+    """Return the angle (rad) by which a sheet is rotated about its normal.
 
-    home: axes (3, 3) that define the angle 0. The smallest rotation that makes both normals equal
-        is applied to them first.
+    axes (3, 3): axes of the sheet as columns; the third column is the normal.
+    home (3, 3): axes of an unrotated sheet. Before the comparison, they are rotated by the smallest
+        rotation that makes their normal equal to the normal of `axes`.
     """
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
@@ -176,12 +179,14 @@ def measure_spin_rad(axes: Floats, home: Floats) -> float:
 def limit_tilt(
     shape: Shape, start: Nearest, found: Nearest, front: Floats, max_tilt_rad: float
 ) -> tuple[Nearest, bool]:
-    """Return the last surface point between `start` and `found` within the maximum tilt.
+    """Return the surface point nearest to `found` at which the sheet's tilt is within its limit.
 
-    front: unit vector (3,) from which the tilt is measured.
+    The points on the way from `start` to `found` are searched. They are projections of the straight
+    line between both points onto the surface.
 
-    The second result is whether the returned point differs from `found`. The search follows the
-    straight line to `found` in increasing steps, and projects each step onto the surface.
+    front: unit vector (3,) from which the tilt of the surface normal is measured.
+
+    The second result is whether the returned point differs from `found`.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
     if found.normal @ front >= limit:

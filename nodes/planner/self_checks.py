@@ -21,11 +21,12 @@ It equals three standard deviations of a calibrated stiffness."""
 def check_stiffness(
     sheet: SheetSpec, calibration: SheetCalibration | None
 ) -> tuple[SelfCheck, ...]:
-    """Compare Young's modulus times thickness in the scene with the calibrated product.
+    """Check whether the sheet's stiffness in the scene agrees with the calibration.
 
-    Returns () if there is no calibration. The two values must agree, because both are used. The
-    rendered forces depend on the calibration. The sag and the limits of the edge force depend on
-    the scene.
+    The stiffness is Young's modulus times thickness, N/m. The rendered forces depend on the
+    calibration. The sag and the limits of the edge force depend on the scene.
+
+    Returns one check, or () if there is no calibration.
     """
     if calibration is None:
         return ()
@@ -88,9 +89,10 @@ class MeasuredForceCheck:
         self._monitor = ResidualMonitor(1, threshold=MAX_FORCE_RATIO)
 
     def add_push(self, push: PlannedPush) -> None:
-        """Store a planned push, and compare earlier measured forces with the sheet model.
+        """Store a planned push, and compare measured forces with the forces of the sheet model.
 
-        Only forces that were measured at least QUIET_S before this push takes effect are compared.
+        A force is compared when all pushes within QUIET_S of its measurement are known. It is
+        ignored if the depth changes during this time.
         """
         self._pushes.append(push)
         limit_ns = push.valid_at_ns - round(1e9 * QUIET_S)

@@ -17,10 +17,10 @@ OffsetAtDepth = Callable[[float], float]
 class StabilizedOffset:
     """A filter that computes the sheet's offset behind the object's tangent plane.
 
-    The filter of the module `hand_loop` smooths the measured depth. The depth is not predicted over
-    the whole delay. A prediction would shift the least stable frequency of the control loop into
-    the range of hand oscillations. The offset never exceeds the depth, so the sheet stays in
-    contact with a finger that moves away.
+    The measured depth is smoothed by the filter in the module `hand_loop`. Prediction does not
+    compensate the full delay of the control loop. With full prediction, the loop would be least
+    stable at the frequencies of hand oscillations. The offset never exceeds the depth, so the sheet
+    stays in contact with a finger that moves away.
     """
 
     def __init__(self) -> None:

@@ -240,7 +240,11 @@ class SheetTrajectoryPlanner:
 
 
 def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajectory | None:
-    """Return the trajectory that stops the sheet, or None if the sheet cannot stop in time."""
+    """Return the trajectory that the sheet follows if no newer target arrives.
+
+    The sheet keeps its velocity for a short time and then brakes to rest. Returns None if braking
+    would take longer than MAX_BRAKE_S.
+    """
     brake_s = max(
         MIN_BRAKE_S,
         measure_length(motion.twist_world[:3]) / bounds.acceleration_m_per_s2,

@@ -1,9 +1,9 @@
 """Measure the time and the image error of the methods that correct the projected image.
 
-The measured time is the time for drawing a stereo frame, without reading its pixels. The method
-`lower_bound` has the minimum of this time: it clears the frame and draws the same triangles once
-for each eye, with the same number of samples. The error is measured at each point that the eye sees
-on a reference sheet. The caller provides this reference, computed independently of the renderer.
+The time is measured for drawing a stereo frame, without reading its pixels. The method
+`lower_bound` draws the same triangles once for each eye, without any correction. Its time is a
+lower bound for the other methods. The error is measured at each point that the eye sees on a
+reference sheet. The caller computes the reference sheet independently of the renderer.
 """
 
 from __future__ import annotations
@@ -60,10 +60,13 @@ SPACING_M = 0.0025
 
 
 def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return the benchmark of all image correction methods for tilted and pushed sheets.
+    """Define the benchmark of all image correction methods for tilted and pushed sheets.
 
-    The cases are those of figures 11 and 13 in Furukawa et al. 2007, and the limits of the scene's
-    working range. solved: whether to include methods that need precomputed deflection shapes.
+    The cases are those of figures 11 and 13 in Furukawa et al. 2007. Further cases are at the
+    limits of the scene's working range.
+
+    reference: function that computes the reference sheet of a case.
+    solved: whether to include methods that need precomputed deflection shapes.
     """
     return Family(
         name="correction",
@@ -133,7 +136,10 @@ def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 
 def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """Return a copy of the scene with another projector resolution and the same lit width."""
+    """Return a copy of the scene with another projector resolution.
+
+    The width of the illuminated area does not change.
+    """
     projector = require_projector(scene)
     lens, scale = projector.lens, width_px / projector.width_px
     cut = 0.5 * (projector.height_px * scale - height_px)
@@ -185,7 +191,11 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet pose of a case, and a function that returns the error measure."""
+    """Return the sheet's pose in a benchmark case, as the renderer predicts it.
+
+    A second result is a function. When it is called, it computes the reference sheet, and returns
+    the function that measures the image error.
+    """
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
@@ -222,7 +232,11 @@ def _draw(
 def draw_coordinate_ramps(
     scene_renderer: SceneRenderer, method: str, sheet: SheetPose
 ) -> tuple[Image, Image]:
-    """Draw the projector's images of both coordinate ramps for one eye, and return the images."""
+    """Draw the projector's images in which colours encode the x and y coordinates of the object.
+
+    Returns the images of the patterns `coordinate_ramp_x` and `coordinate_ramp_y` for one eye. The
+    image error is computed from them.
+    """
     images = []
     for pattern in COORDINATE_RAMPS:
         display = Display(correction=CORRECTION_OF[method], stereo="mono", pattern=pattern)

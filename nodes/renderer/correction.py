@@ -91,10 +91,14 @@ def make_pushed_screen(
 def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
     """Return unit normals (4, 3) of the planes through the eye, the pushed point and each corner.
 
-    As seen from the eye, the lines from the pushed point to the corners divide the image into one
-    sector for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
-    If the screen is one plane, the normals are zero. A single normal is zero if the line to this
-    corner points to the eye. eye (3,): position of the eye, m.
+    A pushed sheet is represented by four triangles between the pushed point and the sheet's
+    corners. From the eye, each triangle covers one sector around the pushed point. A direction d is
+    in sector i if d . normal_i >= 0 > d . normal_(i+1).
+
+    eye (3,): position of the eye, m.
+
+    All normals are zero if the screen is one plane. The normal of a corner is zero if the eye is on
+    the line through the pushed point and this corner.
     """
     if screen.corners is None:
         return np.zeros((4, 3))

@@ -50,7 +50,11 @@ Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return a scene's rubber, and the ranges of stretch and depth of its deflection shapes."""
+    """Return the rubber of a scene's sheet, and the range of pushes that the scene requires.
+
+    The range contains stretch ratios and depths. For this range, the deflections of the pushed
+    sheet are precomputed.
+    """
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(
@@ -62,9 +66,10 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Return the cache key of a scene's deflection shapes, and functions for encoding and decoding.
+    """Define how a scene's deflection shapes are stored in the cache.
 
-    The shapes do not depend on the thickness and Young's modulus of the sheet.
+    The result consists of the cache key, and of functions that encode and decode the shapes. The
+    shapes do not depend on the thickness and Young's modulus of the sheet.
     """
     rubber, within = required_shapes(scene)
     depends_on = {
@@ -92,9 +97,10 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """List copies of a scene that have a stored finger radius and sheet width, with their weights.
+    """List the finger radii and sheet widths whose stored shapes are interpolated for a scene.
 
-    The weighted sum of their deflection shapes interpolates the shapes of the scene.
+    Returns pairs of a weight and a copy of the scene with a stored radius and width. The sum of the
+    deflection shapes, multiplied by the weights, approximates the shapes of the scene.
     """
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
@@ -111,7 +117,13 @@ def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
 
 
 def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> IndentationBasis:
-    """Return a scene's deflection shapes: the weighted sum of stored shapes, scaled in width."""
+    """Interpolate a scene's deflection shapes from stored shapes of similar scenes.
+
+    parts: pairs of a weight and stored shapes.
+
+    The stored shapes are added with their weights. They are scaled along x to the width of the
+    scene's sheet.
+    """
     rubber, _ = required_shapes(scene)
     stored = parts[0][1]
     wider = rubber.width_m / stored.rubber.width_m

@@ -17,13 +17,13 @@ exchange)."""
 
 
 class DisplayLatencyEstimator:
-    """An estimator of the display time of a frame.
+    """An estimator of the time at which a frame will be projected.
 
     The display time (`light_ns`) is the middle of the interval in which the frame is projected. All
-    times are in ns and are from the same clock. If there is a window, the display time is the time
-    of the swap (exchange of the window's buffers) plus a constant latency. If there is no window,
-    the display time is the end of drawing plus this latency. If swaps wait for the projector's
-    refresh, the prediction is based on the next swap for which the frame will be ready.
+    times are in ns and are from the same clock. The display time is a constant latency after the
+    swap of the window's buffers. Without a window, it is this latency after the end of drawing. If
+    swaps wait for the projector's refresh, the estimator predicts at which refresh the frame will
+    be ready.
     """
 
     def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:

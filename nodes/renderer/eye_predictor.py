@@ -64,8 +64,10 @@ class EyePredictor:
     def predict(self, tracked: Input[Eye], horizon_s: float) -> Eye | None:
         """Return the eyes as predicted for a time `horizon_s` after the current time.
 
-        tracked: input with the newest message. Return None if it has no message or one that is too
-        old. An invalid message is returned unchanged.
+        tracked: input port with the newest message about the eyes.
+
+        Returns None if there is no message, or if the newest message is too old. An invalid message
+        is returned unchanged.
         """
         eye, age_s = tracked.message, tracked.age_s()
         if eye is None or age_s > self._max_age.seconds:

@@ -96,10 +96,13 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame, and return its message and the camera exposure time (ns) of its input data.
+        """Draw a frame. Return its message, and the exposure time of the camera images behind it.
 
-        begun_ns: start of drawing. with_pixels: whether the message contains the image. If there is
-        a window, `on_shown` later adds the display time to the message.
+        begun_ns: start of drawing.
+        with_pixels: whether the message contains the image.
+
+        The exposure time is a timestamp (ns). If there is a window, the method `on_shown` later
+        adds the display time to the message.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         self._drawn_of = (ports.skin.message, ports.eye.message, shown)
@@ -174,9 +177,10 @@ class FrameRenderer:
         return self.scene_renderer.place_check_marks(sheet)
 
     def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
-        """Return the message of a frame with its measured display times.
+        """Add the measured display times to the message of a frame, and return the message.
 
-        swapped_ns: time of the swap; 0 if a newer frame replaced the frame.
+        swapped_ns: time of the buffer swap that showed the frame; 0 if the frame was never shown,
+            because a newer frame replaced it.
         """
         if not swapped_ns:
             self.superseded += 1
@@ -191,8 +195,8 @@ class FrameRenderer:
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the drawn object as predicted for the display time `light_ns`.
 
-        If the last response of the soft-body solver is not recent, it is used without prediction.
-        Return two times (ns): the exposure time of the camera image from which the deformation was
+        If the soft-body solver's last response is too old, its deformation is not extrapolated.
+        Returns two times (ns): the exposure time of the camera image from which the deformation was
         computed, and the time for which the deformation was predicted.
         """
         ports, scene_renderer = self._ports, self.scene_renderer

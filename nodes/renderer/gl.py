@@ -101,7 +101,10 @@ class ImagePart:
 
     @contextmanager
     def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
-        """Restrict drawing in `frame` to this part's area and colours until the context exits."""
+        """Return a context manager that restricts drawing in `frame` to this part of the image.
+
+        The part has a viewport and colour channels. On exit, the restriction ends.
+        """
         whole = frame.viewport
         frame.viewport, frame.color_mask = self.viewport, (*self.channels, True)
         if self.is_grey:
@@ -290,7 +293,7 @@ class Programs:
         self._variants: dict[tuple[int, ...], tuple[moderngl.Program, Uniforms]] = {}
 
     def get(self, **macros: int) -> tuple[moderngl.Program, Uniforms]:
-        """Return the variant of the program for given values of the macros, and its uniforms.
+        """Return the shader program for the given macro values, and the program's uniforms.
 
         Every call must pass the same macros in the same order.
         """

@@ -181,7 +181,12 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish the message about a frame; `swapped_ns` is 0 if a newer frame replaced it."""
+        """Publish the message about a frame.
+
+        source_ns: exposure time of the camera images from which the frame was computed.
+        swapped_ns: time at which the window showed the frame; 0 if a newer frame replaced this
+            frame.
+        """
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

@@ -307,8 +307,8 @@ def transfer_matrix(
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Return sample points (n, 3) on triangles (t, 3, 3), and their triangle indices (n,).
 
-    Larger triangles have more samples. Therefore the samples nearest to a point belong to the
-    nearest triangles, even if the triangles differ in size.
+    The samples are used to find the triangles near a point. Larger triangles have more samples, so
+    that they are found, too.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
     parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)

@@ -85,7 +85,10 @@ class Presenter:
         self._thread.start()
 
     def free_slot(self) -> Slot:
-        """Return a slot for drawing. The slot is neither shown nor waiting to be shown."""
+        """Return a slot (textures of one frame) into which the next frame can be drawn.
+
+        The slot is neither shown nor waiting to be shown.
+        """
         with self._changed:
             return next(
                 slot
@@ -94,9 +97,9 @@ class Presenter:
             )
 
     def put(self, slot: Slot) -> None:
-        """Pass a completely drawn slot to the thread, and return immediately.
+        """Pass a completely drawn frame to the display thread, and return immediately.
 
-        The thread shows the slot at the next refresh, unless a newer slot replaces it.
+        The thread shows the frame at the next refresh, unless a newer frame replaces it.
         """
         with self._changed:
             superseded, self._ready = self._ready, slot
@@ -131,9 +134,9 @@ class Presenter:
             glfw.make_context_current(_NO_WINDOW)
 
     def _next(self) -> tuple[Slot, bool] | None:
-        """Wait for the next slot to show.
+        """Wait until a slot (textures of one frame) must be shown.
 
-        Return the slot and whether the slot is new. Return None if `stop` was called.
+        Returns the slot, and whether the slot is new. Returns None if `stop` was called.
         """
         with self._changed:
             while not self._stop:
@@ -175,9 +178,10 @@ class Presenter:
 
 
 class _WindowQuad:
-    """The shader program that draws the image of a slot in the window.
+    """The shader program that draws a finished frame in the window.
 
-    Blocking OpenGL functions are called through ctypes, which releases the interpreter lock.
+    OpenGL functions that block are called through ctypes, so that other Python threads can run
+    meanwhile.
     """
 
     def __init__(self, slots: list[Slot]) -> None:

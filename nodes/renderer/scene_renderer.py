@@ -103,11 +103,14 @@ class SceneRenderer:
     ) -> None:
         """Create the graphics objects of the scene.
 
-        spacing_m: distance between the vertices of the object. samples: samples per pixel. If it is
-        None, `SAMPLES` is used. With a software driver, the first pass of two_pass then uses no
-        multisampling. basis: deflection shapes of the sheet; if it is None, a pushed sheet is drawn
-        as four triangles. sheet_shape: method that computes the shape of the sheet. Raises
-        ValueError if the projector's lens maps several rays to one pixel.
+        spacing_m: distance between the vertices of the object.
+        samples: samples per pixel. If it is None, `SAMPLES` is used. With a software OpenGL driver,
+            the first pass of the correction method two_pass then has only one sample per pixel.
+        basis: precomputed deflection shapes of the sheet; if it is None, a pushed sheet is drawn as
+            four triangles.
+        sheet_shape: method that computes the shape of the sheet.
+
+        Raises ValueError if the projector's lens maps several rays to one pixel.
         """
         projector, geometry = require_projector(scene), scene.object.geometry
         self.scene = scene
@@ -255,14 +258,16 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image. Return an array (height, width, 3) if `read` is true,
-        otherwise None.
+        """Draw the projector's image. If `read` is true, return an array (height, width, 3).
 
-        eyes (1 or 2, 3): positions of the eyes, world frame, m. If `eyes` is None, the eyes of the
-        scene are used. If there are two eyes, they share one image. In the mode frame_sequential,
-        there are two images instead, and the image of the left eye is returned. drawn: function
-        that receives the index of each image as soon as the image is in `canvas.resolved`. Raises
-        ValueError if the sheet's pose is not finite.
+        eyes (1 or 2, 3): positions of the eyes, world frame, m; None means the eyes in the scene.
+        drawn: function that is called when an image is finished in the buffer `canvas.resolved`.
+            Its argument is the index of the image.
+
+        Two eyes share one image, except in the mode frame_sequential. In this mode, each eye has an
+        image, and the image of the left eye is returned.
+
+        Raises ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")
@@ -314,11 +319,13 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image by the method two_pass on a given mesh of the sheet.
+        """Draw the projector's image by the correction method two_pass on a mesh of the sheet.
 
-        Return an array (height, width, 3) if `read` is true, otherwise None. eyes (1 or 2, 3):
-        positions, world frame, m; None for the eyes of the scene. drawn: function that receives the
-        index of each finished image.
+        read: whether to return the image as an array (height, width, 3). If it is false, None is
+            returned.
+        eyes (1 or 2, 3): positions of the eyes, world frame, m. If it is None, the scene's eyes are
+            used.
+        drawn: function that is called after each image is finished, with the index of the image.
         """
         whole = self.canvas.width_px, self.canvas.height_px
 
@@ -378,10 +385,11 @@ class SceneRenderer:
         return image
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
-        """Compute the mesh of the sheet by the method `sheet_shape`.
+        """Compute the mesh of the sheet by the method that the attribute `sheet_shape` selects.
 
-        If there are no deflection shapes, a mesh of four triangles replaces the method
-        reduced_order. The attribute `note` states why the mesh is inaccurate, or is empty.
+        If the deflection shapes for the method reduced_order are not precomputed, the mesh is a
+        pyramid of four triangles. The attribute `note` states why the mesh is inaccurate, or is
+        empty.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
             if self.sheet_shape == "reduced_order":
@@ -397,7 +405,10 @@ class SceneRenderer:
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a warning if the push is too deep for four triangles, otherwise an empty text."""
+        """Return a warning if the push is too deep to represent the sheet by four triangles.
+
+        Otherwise, return an empty text.
+        """
         if sheet.pushed_point is None:
             return ""
         depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])

@@ -1,4 +1,4 @@
-"""Estimate the sheet's pose, and derive the screen for which the projected image is corrected."""
+"""Estimate the sheet's pose and shape, for which the renderer corrects the projected image."""
 
 from __future__ import annotations
 
@@ -87,9 +87,9 @@ def estimate_sheet(
 
 
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
-    """Return the shape of the sheet for which a correction method corrects the image.
+    """Return the shape of the sheet that a correction method assumes.
 
-    Return None if the method is none or two_pass, because these methods need no shape.
+    Returns None for the methods none and two_pass, because they assume no shape.
     """
     if method in ("none", "two_pass"):
         return None

@@ -129,11 +129,13 @@ def deflected_mesh(
 
 
 def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
-    """Estimate the fraction (0 to 1) of the sheet's visible area that folds keep unlit.
+    """Estimate the fraction (0 to 1) of the visible sheet that gets no light because of folds.
 
     A triangle gets no light if it faces away from the projector, or if the projector sees it
     edge-on. The area of an unlit triangle counts twice, because it casts a shadow of about the same
-    area on the sheet. eye, projector (3,): positions, world frame, m.
+    area on the sheet.
+
+    eye, projector (3,): positions, world frame, m.
     """
     # One array for each coordinate is several times faster than an array of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)

@@ -34,8 +34,8 @@ class SkinExtrapolator:
     def add(self, body: SoftBody, header: Header) -> None:
         """Store a response of the soft-body solver.
 
-        Delete the earlier responses if they have another mesh, method or clock, or if their last
-        time is not before the time of this response.
+        Earlier responses are deleted if they belong to another mesh, method or clock. They are also
+        deleted if the new response is not later than the last stored response.
         """
         last = self._history[-1][1] if self._history else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
@@ -68,9 +68,10 @@ class SkinExtrapolator:
         return body, newest_ns + round(ahead_s * 1e9)
 
     def _before(self, newest_ns: int) -> tuple[SoftBody, float] | None:
-        """Return an older response that is suitable for the extrapolation, and its age (s).
+        """Return an earlier response of the soft-body solver, and its age (s).
 
-        The age is the time from the older response to the newest response at `newest_ns`.
+        The response is used for the extrapolation. Its age is the time until the newest response at
+        `newest_ns`. Returns None if no response has a suitable age.
         """
         older = [((newest_ns - at_ns) * 1e-9, body) for at_ns, body in list(self._history)[:-1]]
         for base_s, body in older:

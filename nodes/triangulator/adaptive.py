@@ -182,7 +182,11 @@ def compute_process_noise(dt: float) -> Floats:
 
 
 def _stationary_oscillators() -> Floats:
-    """Return the stationary covariances (models, 2, 2) of the oscillators."""
+    """Return the stationary covariance (2, 2) of each motion model's oscillator.
+
+    The result has the shape (models, 2, 2). The oscillator is a part of the assumed finger motion.
+    Its state is the displacement and the velocity.
+    """
     result = np.zeros((len(DEVIATION_M), 2, 2))
     result[:, 0, 0] = DEVIATION_M**2
     result[:, 1, 1] = (DEVIATION_M * FREQUENCY_RAD_PER_S) ** 2
@@ -210,11 +214,14 @@ def solve_riccati(transition: Floats, process_noise: Floats, variance: float) ->
 
 @lru_cache(maxsize=256)
 def _solve_gains(interval: int, noise: int) -> Floats:
-    """Return the Kalman gains (START_POINTS, models, 5) of one axis for the points of a track.
+    """Return the Kalman gains of all motion models for one axis of a new track.
 
-    interval, noise: indices on the grid of frame intervals and noise variances.
+    interval, noise: exponents that define the frame interval (s) and the variance (m^2) of the
+        measurement noise. The bases are INTERVAL_RATIO and NOISE_RATIO.
 
-    The first gains apply to the points 2 to START_POINTS. The last gain is the steady-state gain.
+    The result has the shape (START_POINTS, models, 5). The first row is the gain for the second
+    point of a track, and each further row is for the next point. The last row is the steady-state
+    gain, which all later points use.
     """
     dt, variance = INTERVAL_RATIO**interval, NOISE_RATIO**noise
     transition, process_noise = compute_transition(dt), compute_process_noise(dt)
@@ -268,7 +275,9 @@ def _find_transition(steps: int) -> Floats:
 
 @lru_cache(maxsize=512)
 def _find_observation(steps: int) -> Floats:
-    """Return the row vectors (models, 1, 5) that predict the position from a state.
+    """Return row vectors (models, 1, 5) that predict the finger's position.
+
+    The product with a filter's state (5,) is the position that the motion model predicts.
 
     steps: prediction horizon in steps of TIME_STEP_S.
     """
@@ -277,9 +286,12 @@ def _find_observation(steps: int) -> Floats:
 
 @lru_cache(maxsize=64)
 def _find_rows(horizons: bytes) -> Floats:
-    """Return the matrix (n, models * 5) that predicts positions at n horizons from weighted states.
+    """Return the matrix (n, models * 5) that predicts the finger's position at n horizons.
 
-    horizons: float64 array (n,) of horizons, s, as bytes, which the cache can hash.
+    The matrix is multiplied by the states of all models, of which each is multiplied by the weight
+    of its model.
+
+    horizons: horizons (n,), s, as the bytes of a float64 array, which can be a cache key.
     """
     rows = [OBSERVED @ compute_transition(float(time)) for time in np.frombuffer(horizons)]
     return np.array(rows).reshape(len(rows), -1)
@@ -287,13 +299,19 @@ def _find_rows(horizons: bytes) -> Floats:
 
 @lru_cache(maxsize=512)
 def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
-    """Return factors (m + 1, n, 1) that combine m weighted sums of predictions at n horizons.
+    """Return factors that interpolate predictions between m horizons with known model weights.
 
-    horizons: float64 array (n,) of horizons, s, as bytes, which the cache can hash.
-    ages_ms: horizons (m,), ms, for which the weights of the m sums were computed.
+    For each of these m horizons, there are weights of the motion models, and thus a weighted
+    prediction. A prediction for another horizon is the sum of the m weighted predictions,
+    multiplied by the factors.
 
-    The last factor multiplies the difference between the filtered position and the first sum at the
-    horizon 0. It decreases from 1 at the horizon 0 to 0 at the first of the m horizons.
+    horizons: n horizons (n,), s, of the result, as the bytes of a float64 array, which can be a
+        cache key.
+    ages_ms: the m horizons (m,), ms.
+
+    The result has the shape (m + 1, n, 1). The last factor is for the correction that makes the
+    prediction continuous with the filtered position. It decreases from 1 at the horizon 0 to 0 at
+    the first of the m horizons.
     """
     times_ms = 1e3 * np.frombuffer(horizons)
     anchors_ms, counts = np.unique(ages_ms, return_counts=True)
@@ -325,7 +343,7 @@ def combine(covariance: Floats) -> Floats:
 class BankEstimate(Estimate):
     """The estimate of a filter bank at one time: the states (models, 5, 3), and their weights.
 
-    The prediction errors are measured at the h horizons in SCORED_HORIZONS_S.
+    The prediction errors are measured at h horizons, SCORED_HORIZONS_S.
 
     covariance: noise covariance (3, 3), m^2, of the newest measured point in the world frame.
     axes: axes of the states as columns (3, 3) in the world frame. The measurement noise is
@@ -333,10 +351,11 @@ class BankEstimate(Estimate):
     points: number of points since the start of the track.
     past_ns, past: times and states of earlier estimates, oldest first. They cover the h horizons.
     error_covariance: covariance (h, 3, models, models), m, of the models' prediction errors along
-        each axis. Each error is divided by the square root of its magnitude.
+        each axis. To limit the influence of large errors, each error is first divided by the square
+        root of its magnitude.
     weights: weights (h, 3, models), whose sum over the models is 1.
-    recent: recent mean square errors (h, 3, models + 1), m^2, of each model and of the weighted
-        sum.
+    recent: mean square prediction errors (h, 3, models + 1), m^2, in the recent past. The last
+        column is for the weighted sum of the predictions.
     scored_ages_ms: ages (h,), ms, of the predictions that were compared with the newest point.
     innovation: mean square error (3,), m^2, of the weighted prediction of the next point.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
@@ -492,13 +511,14 @@ def _prediction_errors(
 ) -> tuple[Floats, tuple[int, ...]]:
     """Return the errors of earlier predictions for a newly measured point.
 
-    times_ns, states: times and states of earlier estimates, oldest first.
-    at_ns, point: time and position (3,) m of the new point, along the axes of the states.
+    times_ns, states: times of earlier estimates, and their filter states, oldest first.
+    at_ns, point: time of the new point, and its position (3,), m, in the axes of the states.
     innovations: errors (models, 3), m, of the predictions from the newest state.
 
-    Returns the errors (h, 3, models), m, for the h horizons in SCORED_HORIZONS_S, and the ages (ms)
-    of the states that predicted the point. The errors for the first horizon are the innovations.
-    Every other horizon uses the newest state that is at least as old, or the oldest state.
+    Returns the errors (h, 3, models), m, for the h horizons SCORED_HORIZONS_S. A second result is
+    the age (ms) of the state from which each prediction was made. For the first horizon, the errors
+    are the innovations. For any other horizon, the newest state that is at least as old as the
+    horizon is used. If all states are newer, the oldest state is used.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T

@@ -104,9 +104,11 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
 
 
 def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
-    """Return cases (see `MARKER_CASES`) for a marker at the centre of the scene's screen.
+    """Return benchmark cases for a marker at the centre of the scene's screen.
 
-    The marker is at rest, or moves at the maximum speed for which the scene is specified.
+    Each case contains radius (px), noise ratio, motion during the exposure (px) and background
+    gradient (levels per px). The marker is at rest, or moves at the maximum speed for which the
+    scene is specified.
     """
     left_from_world = StereoGeometry.of(scene.camera).left_from_world
     px_per_m = scene.camera.left.fx_px / float(rigid.apply(left_from_world, np.zeros(3))[2])

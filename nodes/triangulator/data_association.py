@@ -145,7 +145,11 @@ class Track:
         return float((np.square(appearance - self.appearance) / self.appearance_variance).sum())
 
     def update_appearance(self, appearance: Floats, at_ns: int) -> None:
-        """Update the mean and the variance of the track's appearance with a new appearance (2,)."""
+        """Update the mean and the variance of the track's appearance with a new detection.
+
+        appearance (2,): logarithms of the grey levels of the marker and of its surroundings.
+        at_ns: time of the detection.
+        """
         since_s, residual = (at_ns - self.at_ns) * 1e-9, appearance - self.appearance
         self.appearance = (
             self.appearance - math.expm1(-since_s / APPEARANCE_TIME_CONSTANT_S) * residual

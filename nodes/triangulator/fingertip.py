@@ -110,12 +110,12 @@ class BlobPair:
     """A pair of blobs in the left and the right image that may show the same marker.
 
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
-    gate_fraction: distance from the gate's centre divided by the gate's radius; 0 if there is no
-        gate.
-    cost: sum of the squared deviations of rays, radii, heights and distance from the gate's centre,
-        each divided by its variance.
+    gate_fraction: distance from the predicted position, divided by the radius of the search region
+        (gate); 0 if there is no prediction.
+    cost: measure of the mismatch between both blobs, and of the distance from the predicted
+        position. It is a sum of squared differences, each divided by its variance.
     rejection_reason: reason why the pair cannot be a marker in the finger's working volume; None if
-        it can be one.
+        the pair is acceptable.
     """
 
     left: Blob
@@ -151,7 +151,8 @@ class StereoDetection:
     reason: "ok", or the reason why the finger was not found.
     measured: triangulated point of the finger's marker or of a rejected marker; None if no point
         was triangulated.
-    markers: candidates inside the gate, sorted by cost.
+    markers: candidates inside the gate, the region around the predicted position of the finger's
+        marker. They are sorted by cost.
     clutter: candidates outside the gate.
     """
 
@@ -174,7 +175,13 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """The arguments of `detect_all`. Images and origins are pairs (left, right)."""
+    """The arguments of `detect_all`.
+
+    images: left and right image, which can be cut-outs of the camera images.
+    origins: position (x, y), px, of each image's first pixel in the camera image.
+    volume: minimum and maximum corner (3,), m, of the finger's working volume in the world frame.
+    gate: ball in which the finger's marker is expected; None if the finger is not tracked.
+    """
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
@@ -222,9 +229,10 @@ def detect_all(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the window of each image that shows the gate.
+    """Return the windows of the left and right image in which the finger's marker is expected.
 
-    Returns (None, None) if there is no gate, or if an image does not show the gate.
+    The windows contain the image of the gate, which is a ball around the predicted position.
+    Returns (None, None) if there is no gate, or if it is outside an image.
     """
     if inputs.gate is None:
         return None, None
@@ -251,9 +259,9 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
 def _match_in(
     inputs: DetectionInput, windows: tuple[Window | None, Window | None]
 ) -> StereoDetection:
-    """Match the blobs of one window of each image, and select the finger's marker.
+    """Detect blobs in both images, match them as stereo pairs, and select the finger's marker.
 
-    windows: windows of the left and right image; None means the full image.
+    windows: windows of the left and right image that are searched; None means the full image.
     """
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
@@ -285,10 +293,11 @@ def _match_in(
 def _match_blobs(
     inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
 ) -> list[BlobPair]:
-    """Return all pairs of blobs whose rays are closest to each other in front of both cameras.
+    """Return all pairs of a left and a right blob that could show the same point.
 
-    A pair receives a rejection reason if its reprojection error is too large or its radii are
-    wrong, or if it is outside the finger's working volume.
+    The closest points of the two rays must be in front of both cameras. A pair receives a rejection
+    reason if its reprojection error is too large, or if its radii are wrong. A pair outside the
+    finger's working volume also receives a rejection reason.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
@@ -330,11 +339,11 @@ def _match_blobs(
 
 @dataclass(frozen=True, slots=True)
 class RefinedPair:
-    """A pair of blobs, and its left and right marker after the refinement to subpixel accuracy.
+    """A pair of blobs, with the left and the right marker that are located to subpixel accuracy.
 
-    rejection_reason: reason why the pair cannot be the marker; None if the marker is valid.
-    cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
-        standard deviations.
+    rejection_reason: reason why the pair cannot be the finger's marker; None if it can.
+    cost: cost of the blob pair, plus the squared deviations of the radii from their expected
+        values, each divided by its variance.
     measured: triangulated marker; None if the pair cannot be the marker, or if the rays through the
         centres do not meet.
     """
@@ -347,9 +356,10 @@ class RefinedPair:
 
 
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
-    """Select the finger's marker from pairs of blobs that are likely markers.
+    """Select the finger's marker from blob pairs that probably show round markers.
 
-    Pairs that are not round markers are refined again as flat markers that are seen at an angle.
+    A pair may fail the checks of a round marker after its refinement to subpixel accuracy. It is
+    then refined a second time as a flat marker that is seen at an angle.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
@@ -372,7 +382,10 @@ def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetect
 
 
 def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[RefinedPair]:
-    """Refine the markers of blob pairs, and sort the pairs by their cost before the refinement."""
+    """Refine the markers of blob pairs to subpixel accuracy.
+
+    The result is in the order of the costs that the pairs had before the refinement.
+    """
     ordered = sorted(pairs, key=lambda pair: pair.cost)
     found = []
     for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
@@ -407,8 +420,9 @@ def _check_flat_pair(
     """Check whether two ellipses show one flat marker, and correct their centres for perspective.
 
     Returns both markers with corrected centres, and with the major semi-axis as radius. Returns
-    None if the ellipses do not show one flat marker. The mismatch of the shapes is added to the
-    covariance, because an obstacle in front of a marker shifts its centre by a similar amount.
+    None if the ellipses do not show one flat marker. The measured shapes differ from the ideal
+    ellipses, for example if an obstacle covers part of the marker. This difference is added to the
+    covariance of the centres.
     """
     measured = _triangulate(inputs, markers)
     if measured is None:
@@ -451,10 +465,11 @@ def _flat_pose(
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the valid markers of blob pairs after the refinement, sorted by cost.
+    """Return the valid markers of refined blob pairs, sorted by cost, without false pairs.
 
-    A pair is dropped if its blobs probably show two different markers. Then both blobs belong to
-    pairs with lower costs, or one blob belongs to a pair with a much lower cost.
+    Two markers in both images can form four pairs, of which two are false. A pair counts as false
+    if each of its blobs also belongs to a pair with a lower cost. It also counts as false if one
+    blob belongs to a pair with a much lower cost.
     """
     unique: list[RefinedPair] = []
     for one in sorted(

@@ -21,12 +21,13 @@ from flexsheet.nodes.arrays import Floats
 
 @dataclass(frozen=True, slots=True)
 class DiscView:
-    """A flat disc as seen by one camera.
+    """A flat disc as seen by one camera, where its image is an ellipse.
 
     camera_from_left: rotation (3, 3) from the left camera's axes to the axes of this camera.
     point: centre (3,) m of the disc in this camera's frame.
-    jacobian: derivative (2, 3), px/m, of the pixel with respect to the point.
-    axes: symmetric matrix A (2, 2), px, of the ellipse's edge; see the module `ellipse`.
+    jacobian: derivative (2, 3), px/m, of the centre's pixel coordinates with respect to `point`.
+    axes: symmetric matrix A (2, 2), px. The points of the ellipse's edge are centre + A (cos t, sin
+        t).
     """
 
     camera_from_left: Floats
@@ -82,9 +83,11 @@ def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
 
 
 def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
-    """Return the maximum difference (px) between measured and computed semi-axes of the ellipse.
+    """Return the difference (px) between the measured image of a disc and the expected ellipse.
 
-    normal: normal (3,) of the disc in this camera's axes.
+    The difference is the largest over all directions of the semi-axes.
+
+    normal: assumed normal (3,) of the disc in the camera's axes, which determines the ellipse.
     """
     along = view.jacobian @ normal
     square = radius_m**2 * (view.jacobian @ view.jacobian.T - np.outer(along, along))

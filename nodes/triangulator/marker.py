@@ -74,9 +74,10 @@ class Blob:
     """A bright blob that may be a marker. Lengths are in pixels of the searched image.
 
     centre: centroid of the blob's light.
-    radius: radius of the disc that has the same area as the blob's pixels above half its `height`.
+    radius: radius of the disc with the same area as the pixels that are brighter than the mean of
+        `peak` and `surround`.
     motion: displacement (x, y) during the exposure, estimated from the second moments of the light.
-    spread: smallest second moment of the light, divided by the second moment of a uniform disc with
+    spread: second moment of the light in its narrowest direction, relative to a uniform disc of
         this radius.
     peak, surround: grey levels of the brightest pixel and of the surroundings.
     window: part of the image that contains the blob and its surroundings.
@@ -188,7 +189,10 @@ def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = 
 
 
 def _count_pixels(outline: cv2.typing.MatLike) -> float:
-    """Return the number of pixels inside and on an outline of pixel centres (Pick's theorem)."""
+    """Return the number of pixels that an outline encloses, including the outline itself.
+
+    outline: pixel centres of the outline. The number follows from Pick's theorem.
+    """
     return cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
 
 
@@ -248,11 +252,13 @@ def _make_blob(
     peak: float,
     origin: tuple[int, int],
 ) -> Blob:
-    """Make the blob that a window of a crop of the image contains.
+    """Return the position, size and motion blur of the blob in a window of an image.
 
     cut: pixels of the window.
+    window: rows and columns of the window in the searched part of the image.
     area: number of pixels above half the blob's height (its grey levels above its surroundings).
-    origin: row and column of the crop's first pixel in the image.
+    surround, peak: grey levels of the surroundings and of the brightest pixel.
+    origin: row and column of the first pixel of the searched part in the image.
     """
     rows, columns = window
     skirt = np.float32(surround + SKIRT_FRACTION * (peak - surround))
@@ -298,10 +304,12 @@ MAX_SPREAD = 1.7
 
 @dataclass(frozen=True, slots=True)
 class SystematicError:
-    """The systematic errors of a refinement method, as standard deviations per axis.
+    """The errors of a refinement method that do not come from image noise, in each image direction.
 
-    still_px: error that the pixel grid and an uneven background cause.
-    moving: additional error of a moving marker, as a fraction of its motion during the exposure.
+    still_px: standard deviation of the error that the pixel grid and an uneven background cause,
+        px.
+    moving: standard deviation of the additional error of a moving marker, as a fraction of its
+        motion during the exposure.
     """
 
     still_px: float
@@ -407,7 +415,10 @@ fraction of the marker's height. A partly covered disc has larger odd residuals.
 def fit_flat_markers(
     images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise
 ) -> list[Marker]:
-    """Refine blobs by a maximum-likelihood fit of an ellipse without motion blur."""
+    """Refine blobs as flat round markers, whose images are ellipses.
+
+    An ellipse without motion blur is fitted to each blob by maximum likelihood.
+    """
     return [
         _make_marker(
             blob,

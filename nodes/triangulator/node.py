@@ -66,7 +66,8 @@ class ProcessedPair:
     reason: "ok", or why no fingertip was measured.
     measured: marker of the finger, or None if it was not found.
     detection: markers that were found near the expected fingertip.
-    detect: function of a gate that detects the markers in the pair.
+    detect: function that detects the markers in the pair again. Its argument `gate` is the ball in
+        which the finger's marker is expected, or None.
     """
 
     at_ns: int

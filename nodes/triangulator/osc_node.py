@@ -123,8 +123,8 @@ class OscInputParameters(NodeParameters):
 class OscInput(Node):
     """A node that publishes the positions of the eyes and the fingertip that it receives by OSC.
 
-    If no messages arrive, the node publishes invalid eyes and fingertips. The renderer then uses
-    the eye positions in the scene.
+    If no messages arrive, the published messages are marked as invalid. The renderer then uses the
+    eye positions in the scene.
     """
 
     opens_devices: ClassVar[bool] = True
@@ -234,7 +234,10 @@ class OscInput(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Reopen a closed port, and publish invalid messages for inputs that receive no data."""
+        """Reopen a closed port, and report inputs that receive no data.
+
+        For such an input, a message that is marked as invalid is published.
+        """
         if self.transport is None:
             await self._open()
         else:

@@ -100,8 +100,8 @@ class ProjectionCheck:
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
         """Compare bright points (3,), m, with the expected positions of the projected check marks.
 
-        camera_shift_m: displacement (3,) by which an error of the camera's pose shifts the measured
-            positions of the fixed reference marks.
+        camera_shift_m: measured displacement (3,) of the fixed reference marks, caused by an error
+            of the camera's pose. It is subtracted from the displacement of the check marks.
         at_ns: time of the image pair that shows the points.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
@@ -161,9 +161,13 @@ class ProjectionCheck:
         return np.asarray(np.where(on_sheet[:, None], (now - before) / step_s, np.nan))
 
     def _add_surface(self, heights_m: Floats, ratios: Floats, at_ns: int) -> None:
-        """Add the heights (n,), m, of marks above the expected sheet to the residual monitors.
+        """Check the heights (n,), m, of projected marks above the expected surface of the sheet.
 
-        ratios: displacements (n,) of the marks as fractions of the finger's displacement.
+        ratios: displacements (n,) of the sheet at the marks as fractions of the finger's
+            displacement; 0 for marks that the finger does not move.
+
+        The heights consist of an error of the sheet's height, and of an error of the finger's depth
+        times these ratios. Both errors are estimated and added to their residual monitors.
         """
         if not ratios.any():
             self._surface.add(np.array([heights_m.mean()]), at_ns)
@@ -206,9 +210,11 @@ class ProjectionCheck:
 def make_check(
     cause: SuspectedCause, monitor: ResidualMonitor, *, suspected: bool | None = None
 ) -> SelfCheck:
-    """Make the result of a self-check from the monitor of its residual.
+    """Return the result of a self-check as a message part.
 
-    suspected: whether the cause is suspected; None if the monitor decides.
+    cause: error that the self-check can detect.
+    monitor: statistics of the residual from which the error is detected.
+    suspected: whether the error is suspected; None if the monitor decides.
     """
     is_latency = cause == "display_latency"
     return SelfCheck(

@@ -102,8 +102,10 @@ class CameraCheck:
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
         """Remove the fixed marks and the projected marks from a detection.
 
-        tracked: whether the finger was searched for in a gate. If so, no marker inside the gate is
-            removed.
+        These marks look like the finger's marker, but are not clutter.
+
+        tracked: whether the position of the finger was predicted. In this case, markers near the
+            prediction are not removed.
         """
         marks = np.concatenate([self._marks, self._projection.expected_world_m])
         if not len(marks):

@@ -194,11 +194,11 @@ def fit_ellipses(
 ) -> list[DiscFit]:
     """Fit one ellipse without motion blur in each image (height, width).
 
-    starts: starting values of moving discs. Each ellipse starts with the second moments of the
-        corresponding moving disc.
+    starts: starting values of discs with motion blur. Each ellipse starts with the same second
+        moments as the corresponding disc.
 
-    The ellipses are fitted one by one, because the computing time increases with the third power of
-    the largest ellipse's size.
+    A joint fit would use the window size of the largest ellipse for all ellipses. Therefore each
+    ellipse is fitted separately.
     """
     found = []
     for image, one in zip(images, starts, strict=True):
@@ -242,8 +242,8 @@ class DiscSolution:
     residuals: differences (n, s * s) between image and model before the last step.
     weights: inverse noise variances (n, s * s) of the pixels; zero for excluded pixels.
     information: Fisher information plus prior (n, parameters, parameters).
-    gains: first-order reduction (n, parameters) of the weighted squared residuals by the last step
-        of each parameter.
+    gains: decrease (n, parameters) of the weighted squared residuals in the last step, to first
+        order. It is the contribution of each parameter.
     converged: whether each disc (n,) has converged.
     """
 
@@ -287,11 +287,12 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
 
 
 def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]]:
-    """Return the weighted sum of squared residuals, and three related numbers, for each fit.
+    """Return four numbers that describe the residuals of each fit.
 
-    These are the number of pixels, the sum of weights, and a variance ratio. The ratio is the
-    variance of the odd part of the residuals divided by the variance of the sensor noise. The odd
-    part consists of differences between pixels mirrored about the centre.
+    The numbers are the weighted sum of squared residuals, the number of pixels, the sum of the
+    weights, and a variance ratio. For the ratio, the differences between pixels that are mirrored
+    about the centre are used. Their variance is divided by the variance that the sensor noise would
+    cause.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -335,7 +336,11 @@ class DiscCutouts:
 def _cut_out_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> DiscCutouts:
-    """Return a window around each disc. The weight of a pixel is 0 outside the image or margin."""
+    """Cut a window around each disc out of the images.
+
+    The weight of a pixel in the fit is 0 if the pixel is outside the image. It is also 0 if its
+    distance from the disc exceeds the border width, which is `MARGIN_PX` for a disc at rest.
+    """
     lengths = [math.hypot(*one.motion) for one in starts]
     reaches = [
         one.radius + max(MARGIN_PX - MARGIN_PER_MOTION * length, MIN_MARGIN_PX)
@@ -462,7 +467,11 @@ def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats
 
 
 def _elongation(start: DiscStart) -> tuple[float, float]:
-    """Return the elongation (e, f), px, of an ellipse with the second moments of a moving disc."""
+    """Return the elongation of an ellipse with the same second moments as a disc in motion.
+
+    The elongation (e, f), px, has the direction of twice the angle of the long axis. Its length is
+    half the difference of the semi-axes.
+    """
     length = math.hypot(*start.motion)
     if length == 0.0:
         return 0.0, 0.0
@@ -491,10 +500,11 @@ def _make_fit(
     is_ellipse: bool,
     converged: bool,
 ) -> DiscFit:
-    """Make the result of one fit, with a larger covariance if the residuals exceed the noise.
+    """Return the result of one fit, with the covariance scaled to the residuals.
 
-    corner: column and row of the cut-out's first pixel.
-    fitness: one element of the result of `_fit_residuals`.
+    found: fitted parameters.
+    corner: column and row of the window's first pixel in the image.
+    fitness: four numbers that describe the residuals, as computed by `_fit_residuals`.
     """
     squares, pixels, weight, ratio = fitness
     x, y, radius, blur, marker, ground, _, _, *others = found

@@ -62,9 +62,12 @@ class PositionMeasurement:
     covariance: Floats
 
     def can_reach(self, later: PositionMeasurement, max_speed: float) -> bool:
-        """Return whether a finger can move from this point to a later point, despite noise.
+        """Return whether a finger can move from this measured point to a later measured point.
 
         max_speed: maximum speed of the finger, m/s.
+
+        The distance may exceed the distance at maximum speed by GATE_SIGMAS standard deviations of
+        the measurement noise.
         """
         distance = float(np.linalg.norm(later.measured - self.measured))
         noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
@@ -79,7 +82,11 @@ class Gate:
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Return whether the true position of a measured point can be inside the gate."""
+        """Return whether a measured point can be in the gate, given its uncertainty.
+
+        The distance from the centre may exceed the radius by GATE_SIGMAS standard deviations of the
+        noise.
+        """
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
@@ -131,7 +138,7 @@ class Tracker:
         return "tracking" if at_ns == self.estimate.at_ns else "coasting"
 
     def gate(self, at_ns: int) -> Gate | None:
-        """Return the gate at a time after the newest point of the track.
+        """Return the gate, the ball in which the marker is expected, at a time.
 
         Returns None if the finger is not tracked, or if `at_ns` is not after the newest point.
         """
@@ -271,7 +278,11 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Return `previous` with a new point appended, or only this point if it does not fit."""
+        """Append a point to a run of successive points, or begin a new run with this point.
+
+        A new run begins if the finger cannot move from the last point to the new point. It also
+        begins if the new point is not later, or is later by more than the time-out of a track.
+        """
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]
@@ -289,9 +300,10 @@ class Tracker:
     def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
         """Insert a late point into the history, and filter all later points again.
 
-        If several consecutive points are late, they restart the track, because the clock was
-        probably set back. A single late point is dropped if no point is missing at its time, or if
-        a finger cannot move through this point.
+        A late point is older than the newest point of the track. It is inserted only if the history
+        has a gap at its time, and if a finger can move through this point. Otherwise, it is
+        dropped. If several consecutive points are late, the clock was probably set back, and the
+        track restarts with these points.
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:

@@ -436,7 +436,8 @@ class ArmServer:
     ) -> None:
         """Store the settings. The method `start` opens the port.
 
-        before: function that is called before each request. It must call `controller.advance`.
+        before: function that is called before each request is processed. It must call
+            `controller.advance` to advance the simulated controller to the present time.
         """
         self.controller = controller
         self._address = (host, port)

@@ -83,10 +83,11 @@ class TwinBoard:
         self._rays = tuple(self._cast(lens) for lens in (camera.left, camera.right))
 
     def _cast(self, lens: Lens) -> Singles:
-        """Return x/z and y/z (RAYS * height, RAYS * width, 2) of the rays through the image.
+        """Return the directions of RAYS x RAYS rays through each pixel of the camera image.
 
-        The rays within a pixel are equally spaced, because the distortion varies little within a
-        pixel.
+        The result contains x/z and y/z, shape (RAYS * height, RAYS * width, 2). The distortion
+        varies little within a pixel. Directions within a pixel are therefore extrapolated linearly
+        from its centre.
         """
         height, width = self.camera.height_px, self.camera.width_px
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)

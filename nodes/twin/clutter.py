@@ -26,10 +26,14 @@ its marker from the cameras."""
 
 
 class Trajectory(Protocol):
-    """The interface of a position as a function of simulation time."""
+    """The motion of a clutter object: its position as a function of the simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the position (3,), m, in the world frame or relative to the fingertip."""
+        """Return the position (3,), m, at a simulation time.
+
+        For objects that are carried by the hand, the position is relative to the fingertip. For
+        other objects, it is in the world frame.
+        """
         ...
 
 
@@ -153,10 +157,10 @@ def touching_highlight(overlap: float) -> Clutter:
 
 
 def covered(share: float, *, views: Views = "both") -> Clutter:
-    """Return clutter that consists of an occluder with a straight edge across the marker.
+    """Return clutter with one straight-edged obstacle that hides part of the marker.
 
-    share: hidden fraction (0 to 1) of the marker, from the side +x. If it is 1, the blurred edge of
-        the marker is also hidden.
+    share: hidden fraction (0 to 1) of the marker's area, starting at the side +x. The value 1 also
+        hides the blurred edge of the marker.
     views: cameras in which the marker is hidden.
     """
     radius_m = 0.05

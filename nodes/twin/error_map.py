@@ -53,9 +53,10 @@ class ErrorMap:
 
 
 def error_map(coordinate_ramp_x: Image, coordinate_ramp_y: Image, metres_per_px: float) -> ErrorMap:
-    """Measure the image errors from the eye's images of both position codes.
+    """Measure the image errors from two images in which colours encode object coordinates.
 
-    coordinate_ramp_x, coordinate_ramp_y: images (rows, columns, 3).
+    coordinate_ramp_x, coordinate_ramp_y: images (rows, columns, 3) at the eye, whose colours encode
+        x and y.
     metres_per_px: pixel size on the imaginary screen.
     """
     seen = _lit(coordinate_ramp_x) & _lit(coordinate_ramp_y)
@@ -77,9 +78,9 @@ def _lit(picture: Image) -> Bools:
 
 
 def _places(picture: Image) -> tuple[Floats, Bools]:
-    """Return the position (m) that each pixel encodes, and a mask of valid positions.
+    """Decode the object coordinate (m) from the colour of each pixel.
 
-    Both arrays have the shape (rows, columns).
+    Returns the coordinates and a mask of valid pixels, both with the shape (rows, columns).
     """
     red, green, blue = np.moveaxis(picture.astype(np.float64) / 127.5 - 1.0, -1, 0)
     phase = np.arctan2(green, red) / (2.0 * np.pi)

@@ -99,13 +99,14 @@ class Hits:
 def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
     """Find the first triangle that each ray hits.
 
+    rays: rays from one origin through the pixels of an image.
     vertices (v, 3): positions, m.
     triangles (t, 3): indices of vertices.
 
-    A direction is written as d = sum of w_i (vertex_i - origin) over the corners of a triangle. The
-    ray hits the triangle if all w_i >= 0, at the ray parameter 1 / sum(w). The weights w_i are
-    linear in column and row. Triangles that extend behind the origin, or whose plane contains the
-    origin, are ignored.
+    A ray direction is d = sum of w_i (vertex_i - origin) over the corners of a triangle. The ray
+    hits the triangle if all w_i >= 0, at the ray parameter 1 / sum(w). The weights w_i are linear
+    functions of the pixel's column and row. Triangles that extend behind the origin, or whose plane
+    contains the origin, are ignored.
     """
     corners = (vertices - rays.origin)[triangles]
     basis = np.column_stack([rays.first, rays.right, rays.down])

@@ -69,12 +69,13 @@ class TwinEyeParameters(SimulatorParameters):
 
 
 class TwinEyeNode(Node):
-    """A node that renders the eye's image of labelled frames.
+    """A node that simulates the image that the user's eye sees of a displayed frame.
 
-    An image takes about a second to render. Therefore the node renders one frame per label,
-    correction method and eye, and ignores further frames. It renders only frames that contain the
-    pixels of a single view. A mono frame is rendered from the viewpoint in the parameters. A frame
-    for one eye is rendered from the position of this eye.
+    Only frames with a label are simulated. An experiment labels the frames that it evaluates. An
+    image takes about a second to render. Therefore the node renders one frame per label, correction
+    method and eye, and ignores further frames. The frame must contain its pixels, drawn for one
+    viewpoint only. If it was drawn for one eye, the viewpoint is the position of this eye.
+    Otherwise the viewpoint in the parameters is used.
 
     The sheet is rendered as it is when the projector shows the frame, a few milliseconds after the
     frame arrives. The finger position is taken from the latest exposure. The deformation is the
@@ -188,9 +189,11 @@ class TwinEyeNode(Node):
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
         """Return the true world position (3,), m, of the simulated eye at the time `at_s`.
 
-        The viewpoint is one of the tracked eyes, or their midpoint. If no eyes are tracked, the
-        eyes of the true scene are used. The offset of tracked eyes in the parameter `apparatus`
-        (true hardware parameters) and the simulated head motion are added.
+        viewpoint: left eye, right eye, or the midpoint of both.
+
+        The position is the tracked position of the eyes plus the tracking error in the parameter
+        `apparatus`. If no eyes are tracked, it is the position in the true scene. The simulated
+        head motion is added.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

@@ -81,7 +81,10 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """Return the time (s) at which the finger leaves the first point; it is at most 0."""
+        """Return the time (s) at which the finger leaves the first point.
+
+        The time is at most 0. It is negative if rounded corners make the motion start earlier.
+        """
         ...
 
     def speeds(self) -> Floats:
@@ -126,12 +129,19 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,), m/s, along the lines. The rounded motion is not faster."""
+        """Return the speeds (n - 1,), m/s, on the straight segments.
+
+        They are upper bounds on the speed of the rounded motion.
+        """
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
     def _corner(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the position (3,), m, on the polyline and its integral (3,), m s, since time 0."""
+        """Return the position on the polyline without rounding, and its time integral from time 0.
+
+        The position (3,) is in m, and the integral (3,) in m s. Differences of the integral give
+        the moving average that rounds the corners.
+        """
         if time_s <= 0.0:
             return self.points[0], self.points[0] * time_s
         if time_s >= self.times_s[-1]:
@@ -188,9 +198,8 @@ class SmoothPath:
     def speeds(self) -> Floats:
         """Return upper bounds (n - 1,), in m/s, on the speed between n successive samples.
 
-        Between two samples, the velocity is a quadratic Bezier curve within the triangle of its
-        control points. Two control points are the end velocities. The third is 3 times the mean
-        velocity minus both end velocities.
+        Between two samples, the velocity is a quadratic Bezier curve. Its speed never exceeds the
+        maximum magnitude of the three control points.
         """
         ends = self.rates
         mean = np.diff(self.points, axis=0) / np.diff(self.times_s)[:, None]
@@ -275,15 +284,17 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """The motion of the fingertip to a path and along it, with wander (slow noise) and tremor.
+    """The motion of the fingertip along a path, with wander (slow noise) and tremor.
+
+    The motion starts at the present position, and first moves to the first point of the path.
 
     start, start_velocity: position and velocity when the path message arrived, without wander and
         tremor.
     ease_s: duration of the motion to the first point.
     amplitudes_before_m, amplitudes_m: amplitudes of wander and tremor before the path message and
         on the path. During the motion to the first point, they are interpolated.
-    age_s: time argument of `wander` and `tremor` when the path message arrives. It includes the
-        durations of earlier motions, so that wander and tremor are continuous.
+    age_s: total duration of the motions before this path. Wander and tremor are functions of the
+        total time, so that they are continuous.
     """
 
     path: Path
@@ -306,7 +317,8 @@ class FingerMotion:
     ) -> FingerMotion:
         """Make the motion of a finger that rests at `position` (3,), m.
 
-        seed: random seed of the deviations on later paths.
+        seed: seed of the random wander and tremor that are added when the finger follows later
+            paths.
         """
         generator = np.random.default_rng(seed)
         return FingerMotion(
@@ -445,12 +457,13 @@ def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:
 def _reach(
     s: float, duration_s: float, start: Floats, start_velocity: Floats, path: Path
 ) -> tuple[Floats, Floats]:
-    """Return position (m) and velocity (m/s) during a minimum-jerk reach to a path.
+    """Return position (m) and velocity (m/s) during a motion to the first point of a path.
 
     s: fraction of the duration, 0 at `start` and 1 at the first point of the path.
 
-    The quintic Hermite function s (1-s)^3 (1+3s) makes the initial velocity decay. Therefore
-    position and velocity are continuous.
+    The motion is the minimum-jerk motion between both points plus a term for the initial velocity.
+    This term is the quintic Hermite function s (1-s)^3 (1+3s) times velocity and duration.
+    Therefore position and velocity are continuous.
     """
     share, slope = minimum_jerk_profile(s)
     carried = s * (1.0 - s) ** 3 * (1.0 + 3.0 * s)

@@ -309,9 +309,10 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return the maximum delay (ns) of an exposure that does not cause a missed image pair.
+        """Return the maximum delay (ns) at which an exposure can still start.
 
-        An exposure may overlap the read-out of the previous image pair.
+        If the computer is later, the camera misses an image pair. An exposure may overlap the
+        read-out of the previous image pair.
         """
         overlap_ns = self.exposure_ns + round(1e9 * self._read_out_s) - self.period_ns
         return self.exposure_ns + max(0, overlap_ns)

@@ -46,7 +46,7 @@ force."""
 
 
 class ForceHistory:
-    """The state of the hysteresis and creep of one force of the sheet.
+    """The state of hysteresis and creep for one force that the sheet exerts.
 
     hysteresis_ratio: fraction of the loading energy that is lost in a cycle from zero force. It
         includes the loss by creep.
@@ -64,7 +64,9 @@ class ForceHistory:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self | None:
-        """Make the force history from the true sheet parameters of an apparatus.
+        """Make the force history from the true sheet parameters.
+
+        apparatus: true parameters of the simulated hardware.
 
         Returns None if the sheet has neither hysteresis nor creep.
         """
@@ -121,10 +123,11 @@ def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> 
 
 
 def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the ratios (2,) of the rubber's force to the elastic force, in loading and unloading.
+    """Return the ratios (2,) of the sheet's force to its elastic force, in loading and unloading.
 
-    The elastic force increases linearly to `TURNING_RATIO` times the force at which the ratios are
-    evaluated, and decreases again.
+    The ratios differ from 1 because of hysteresis and creep. They are evaluated at one elastic
+    force. For loading, the elastic force increases linearly up to this force and on to
+    `TURNING_RATIO` times this force. For unloading, it then decreases again.
     """
     history = ForceHistory.of(apparatus)
     if history is None:

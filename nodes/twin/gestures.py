@@ -6,9 +6,10 @@ The gestures follow published measurements of human motion:
     (Atkeson and Hollerbach 1985, J. Neurosci. 5:2318). It is the profile of minimum jerk (Flash and
     Hogan 1985, J. Neurosci. 5:1688). Its peak speed is 1.875 times the mean speed. Its maximum
     acceleration is 5.77 distance / duration^2.
-- Unhurried reaches have peak speeds of 0.2-0.35 m/s (REACH+). Hurried elbow flexions of 27-45
-    degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341). The deceleration
-    takes half of this time, 50-80 ms.
+- The peak speed of unhurried reaches is assumed to be 0.2-0.35 m/s. Encountered-type displays were
+    tested at these robot speeds (Gonzalez, Abtahi and Follmer 2020, REACH+).
+- Hurried elbow flexions of 27-45 degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav.
+    14:341). The deceleration takes half of this time, 50-80 ms.
 - People explore a surface at 77-86 mm/s on average (Smith, Gosselin and Houde 2002, Exp. Brain Res.
     147:209).
 - In typing, the interval between taps is 150-500 ms (Angelaki and Soechting 1993, Exp. Brain Res.
@@ -16,7 +17,7 @@ The gestures follow published measurements of human motion:
     (finger tapping test of the Halstead Reitan battery). The contact is assumed to last 100-200 ms
     of an unhurried tap, and about half of a hurried tap. There is no source for soft objects.
 - After a signal to stop a reach, people need 206 ms on average to react (Mirabella, Pani, Pare and
-    Ferraina 2006, Exp. Brain Res. 174:240). Therefore a stop is sudden only for an observer.
+    Ferraina 2006, Exp. Brain Res. 174:240).
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
     motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
 - Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411). Its amplitude is
@@ -111,7 +112,11 @@ def _sampled_times(duration_s: float) -> Floats:
 
 
 def touched(motion: Sampled) -> Sampled:
-    """Return a motion on the surface with an approach from above, short rests and a lift added."""
+    """Extend a motion on the surface by an approach and a lift.
+
+    The finger approaches the first point from above and rests briefly. After the motion, it rests
+    again and is lifted.
+    """
     times, places = motion
     first, last = places[0], places[-1]
     above_first, above_last = (np.array([*place[:2], HOVER_M]) for place in (first, last))
@@ -214,14 +219,21 @@ def tap(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Return a path of taps as fast as people can: 5.4 a second, with 85 ms of contact each."""
+    """Return a path of taps at the fastest rate of people: 5.4 taps per second.
+
+    In each tap, the finger is in contact for 85 ms.
+    """
     return _taps(
         scene, "tap-fast", count=25, every_s=0.185, contact_s=0.085, lift_m=0.006, seed=seed
     )
 
 
 def _arc_run(scene: Scene) -> tuple[float, float]:
-    """Return half the arc length (m) and the speed (m/s) of a stroke of the finger."""
+    """Return the amplitude (m) and the speed (m/s) of a stroke of the finger around the object.
+
+    The amplitude is half of the touchable length, which the front of the object divides into two
+    halves.
+    """
     half = 0.5 * touchable(scene)[1]
     return half, min(scene.working_range.speed_m_per_s, half / 0.3)
 
@@ -316,7 +328,10 @@ def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _touch_along(arcs: Floats) -> Floats:
-    """Return surface positions (n, 3) of a light touch at arc lengths (n,), m."""
+    """Return the surface positions (n, 3) of a finger that lightly presses the centre line.
+
+    arcs: distances (n,) along the centre line, m.
+    """
     return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -TOUCH_M)], axis=1)
 
 

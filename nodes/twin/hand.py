@@ -168,11 +168,12 @@ class EdgeTrack:
 
 
 class CoupledFinger:
-    """A simulation of how far the sheet's force moves a finger away from its voluntary path.
+    """A simulation of a finger that the sheet's force pushes away from its voluntary path.
 
     path: voluntary motion; it may be replaced at any time.
-    deviation_m, rate_m_per_s (3,): deviation and its rate of change.
-    force_n (3,): force of the sheet on the finger, averaged over the last interval.
+    deviation_m, rate_m_per_s (3,): deviation from the path, and its rate of change.
+    force_n (3,): force of the sheet on the finger, averaged over the last interval of the
+        integration.
     log: rows (time in s, indentation in m, force in N) of all steps; None if they are not recorded.
     """
 
@@ -187,8 +188,8 @@ class CoupledFinger:
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
         """Return a copy of this simulation, advanced to `time_s`.
 
-        If this simulation is more than MAX_PREDICTION_S behind `time_s`, it is first advanced
-        until it is MAX_PREDICTION_S behind.
+        The copy predicts at most MAX_PREDICTION_S. If this simulation is further behind `time_s`,
+        it is itself advanced first.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)

@@ -89,9 +89,12 @@ class LitMarks:
             self._frames.append((frame.light_ns + late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
-        """Return the illuminated points (n, 3), world frame, m; empty if the points are unknown.
+        """Return the points (n, 3) of the sheet that projected check marks illuminate.
 
-        finger (3,): position of the fingertip at the time `at_ns`, m.
+        finger (3,): position of the fingertip at the time `at_ns`, m, which deforms the sheet.
+
+        The points are in the world frame, m. The result is empty if no marks are displayed. It is
+        also empty if the finger has moved too far since the sheet's shape was computed.
         """
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:

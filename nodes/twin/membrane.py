@@ -598,9 +598,10 @@ def _insert_midpoints(boundaries: Floats) -> Floats:
 
 
 def _cone(mesh: _Mesh, focus_m: tuple[float, float], rubber: TrueRubber) -> Floats:
-    """Return the fraction (nodes,) of a finger step by which each node moves in the initial guess.
+    """Return the initial guess of the displacement when a finger pushes a sheet.
 
-    The fraction is 1 at the pushed point `focus_m` and decreases linearly to 0 near the clamps.
+    The result (nodes,) is the displacement of each node as a fraction of the finger's displacement.
+    It is 1 at the pushed point `focus_m` and decreases linearly to 0 near the clamps.
     """
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus_m

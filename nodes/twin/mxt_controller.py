@@ -236,9 +236,10 @@ class MxtController:
             self.answers.append((self._answer(command, receive_type, packet), sender))
 
     def _stay(self, sender: Address) -> None:
-        """Stop the arm after a packet that only requests the state.
+        """Stop the arm at its present joint angles, after a packet that only requests the state.
 
-        The next set-point must agree with the measured joint angles, like the first set-point.
+        The next set-point counts as the first, and must therefore agree with the measured joint
+        angles.
         """
         self._master = sender
         if self._moved:
@@ -290,9 +291,10 @@ class MxtController:
         return whole[:-4] if self.fault == "bad_crc" else whole
 
     def _monitor(self, wanted_type: int) -> tuple[float, ...]:
-        """Return the requested state of the arm as a data type, eight numbers and two flags.
+        """Return the fields of an answer that contain the requested state of the arm.
 
-        The data type is 0 if the requested quantity is not available.
+        The fields are a data type, eight numbers and two flags. The data type is 0 if the requested
+        quantity is not available.
         """
         if wanted_type in _JOINTS:
             joints = self._seen(_JOINTS.index(wanted_type))
@@ -302,13 +304,14 @@ class MxtController:
     def _currents_percent(self) -> list[int]:
         """Return the motor currents (6,) in percent of the rated current, rounded to integers.
 
-        Static friction carries a part of the weight and of the load.
+        The currents balance the arm's weight and load. Static friction changes each current by a
+        constant random value.
         """
         balance = UNLOADED_PERCENT - self.load_nm / TORQUE_PER_PERCENT_NM
         return [round(float(one)) for one in balance + self._stuck_percent]
 
     def _seen(self, what: int) -> Floats:
-        """Return the joint angles (6,), rad, that a client has requested.
+        """Return one of three kinds of joint angles (6,), rad, for an answer to the client.
 
         what: 0 for the set-point, 1 for the filtered set-point, 2 for the measured angles.
         """
@@ -324,8 +327,8 @@ class MxtServer:
     ) -> None:
         """Store the settings. The method `start` opens the port.
 
-        before: function that is called before each packet and cycle. It must call
-            `controller.advance`.
+        before: function that is called before each packet is processed and before each cycle. It
+            must call `controller.advance` to advance the simulated controller to the present time.
         """
         self.controller = controller
         self._address = (host, port)

@@ -73,7 +73,10 @@ class Nail:
         return None if length < 1e-6 else across / length
 
     def find_axis_shift_m(self, radius_m: float) -> Floats:
-        """Return the vector (3,) from the fingertip to the start of the finger's axis.
+        """Return the vector (3,), m, from the fingertip to the end of the finger's centre line.
+
+        The centre line is below the nail by a multiple THICKNESS_RATIO of the radius. The vector is
+        zero if the finger is round.
 
         radius_m: half of the finger's breadth.
         """

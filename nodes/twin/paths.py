@@ -50,11 +50,11 @@ def map_to_surface(scene: Scene, places: Floats) -> Floats:
 
 
 def touchable(scene: Scene) -> tuple[float, float]:
-    """Return the lengths (m), along and around the object, of the touchable part of its surface.
+    """Return the lengths (m) of the touchable surface along the object and around the object.
 
-    The lengths extend equally to both sides of the front (the point that faces the user). Three
-    limits apply: 0.8 of the length of an object with ends, the maximum tilt of the working range,
-    and the usable part of the sheet.
+    The touchable surface is centred on the front of the object, the point that faces the user. Its
+    lengths are limited by the maximum tilt of the working range and by the usable part of the
+    sheet. If the object has ends, only 0.8 of its length is used.
     """
     return _surface_map_of(scene).touchable_m
 
@@ -62,9 +62,12 @@ def touchable(scene: Scene) -> tuple[float, float]:
 class SurfaceMap:
     """A map from surface positions on a scene's object to world points.
 
-    The distances `along` and `arc` are measured on geodesics over a grid. Points between the grid
-    points are interpolated by bicubic splines and projected onto the surface. Therefore a mapped
-    path is as smooth as the surface.
+    A surface position is (along, arc, height). From the front of the object, `along` is the
+    distance in the direction of its x axis. `arc` is the distance at right angles to this
+    direction. Both are measured on geodesics.
+
+    The map is a precomputed grid of points, interpolated by bicubic splines and projected onto the
+    surface. Therefore a mapped path is as smooth as the surface.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -138,9 +141,13 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines for the surface points as functions of the distances `along` and `arc`, m.
+        """Fit splines that map two coordinates on the object's surface to surface points.
 
-        In both coordinates, the splines cover 1.25 times the touchable length.
+        The coordinates are the distances `along` and `arc`, m, from the point `front` in
+        perpendicular directions. In each direction, the splines cover 1.25 times the length that
+        the finger can touch.
+
+        heading (3,): direction of the coordinate `along` at `front`.
         """
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
@@ -159,8 +166,8 @@ class SurfaceMap:
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
     """Return the surface point nearest to a distant user.
 
-    If this point is on an end of the object, the result is the point that the user sees in the
-    direction of the object's origin.
+    This point can be on an end of the object. The result is then the point that the user sees in
+    the direction of the object's origin.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
@@ -209,7 +216,10 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
 
 
 def _surface_map_of(scene: Scene) -> SurfaceMap:
-    """Return the surface map of a scene. The maps of the latest scenes are cached."""
+    """Return the map from surface coordinates to world points for a scene's object.
+
+    The maps of the latest scenes are cached.
+    """
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
     if key not in _SURFACE_MAPS:
         while len(_SURFACE_MAPS) >= MAX_CACHED_SURFACE_MAPS:
@@ -246,12 +256,13 @@ def place_path(
     wander_m: float,
     tremor_m: float,
 ) -> FingerPath:
-    """Make a path in the scene from a smooth motion in surface positions.
-
-    If the path with wander and tremor would leave the scene's finger volume, the motion is scaled
-    down. If the path would exceed the scene's maximum finger speed, the motion is slowed down.
+    """Convert a motion in surface positions to a finger path in the scene.
 
     times_s, places: sample times (n,) and surface positions (n, 3), m.
+    wander_m, tremor_m: amplitudes of slow noise and tremor, which are later added to the path.
+
+    If the path including this noise would leave the scene's finger volume, it is scaled down. If it
+    would exceed the scene's maximum finger speed, it is slowed down.
 
     Raises FingerPathError if the volume does not contain the front of the object.
     """
@@ -341,7 +352,10 @@ def _soft_max(values: Floats, floor: float, bend: float) -> Floats:
 
 
 def _soft_clip(values: Floats, half: float) -> Floats:
-    """Limit values (n,) smoothly to +-half. The transition has the width 0.2 half."""
+    """Limit values (n,) smoothly to the range from -half to half.
+
+    The width of the transition at each limit is 0.2 * half.
+    """
     return -_soft_max(-_soft_max(values, -half, 0.2 * half), -half, 0.2 * half)
 
 

@@ -480,12 +480,15 @@ class TwinCamera:
         return window
 
     def _flat_disc(self, eye: CameraView, places: Floats, normal: Floats) -> Window | None:
-        """Draw a flat marker that passes through world points (n, 3) during the exposure.
+        """Draw a flat marker that moves during the exposure.
 
-        Returns the drawn window, or None if the disc is not visible or is seen from behind.
+        places (n, 3): world positions of its centre during the exposure.
+        normal (3,): normal of the marker.
 
-        The disc is a sum of Gaussian spots. For a disc larger than the blur, the sum is within 1 %
-        of the light of a uniform disc.
+        Returns the drawn window, or None if the marker is not visible or is seen from behind.
+
+        The marker is drawn as a sum of Gaussian spots. If it is larger than the blur, its total
+        light differs by at most 1 % from a uniform disc.
         """
         in_camera = apply(eye.camera_from_world, places)
         centre = in_camera.mean(axis=0)

@@ -101,7 +101,7 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """A simulated stereo camera in front of a flat sheet that the projector illuminates."""
+    """A simulation of a sheet that a projector illuminates and a stereo camera observes."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
         """Store the parameters of the simulated devices.
@@ -248,11 +248,16 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """Return the distances (n,), m, between intended and actual projected points.
+    """Return how far a calibrated projector misses the intended points, as seen by an eye.
 
-    The distances are measured as an eye sees them on the imaginary screen (world plane z = 0). The
-    points form a grid of +-half_m on each plane (4, 4). The calibrated projector `believed`
-    computes their pixels, and the projector `true` projects these pixels.
+    believed: calibrated projector, from which the pixels of the intended points are computed.
+    true: true projector, which projects these pixels.
+    planes: poses (4, 4) of planes. On each plane, the intended points form a square grid with half
+        the width `half_m`.
+
+    The result (n,), m, contains the distances between intended and actual points. The eye's rays
+    through these points meet the imaginary screen (world plane z = 0), where the distances are
+    measured.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

@@ -90,7 +90,7 @@ def make_true_camera(camera: StereoCamera) -> StereoCamera:
 
 
 def pixels_of(lens: Lens, slopes: Floats) -> Floats:
-    """Project rays to pixels (..., 2) of a lens with Brown's distortion.
+    """Return the pixels (..., 2) at which a lens with Brown's distortion images rays.
 
     slopes (..., 2): x/z and y/z of the rays.
     """
@@ -111,10 +111,10 @@ def project_ray(lens: Lens, u: T, v: T) -> tuple[T, T]:
 
 
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
-    """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion; dy/du equals dx/dv.
+    """Return the partial derivatives of Brown's lens distortion with respect to the ray.
 
-    u, v: x/z and y/z of the ray.
-    x, y: these slopes after the distortion.
+    The distortion maps the undistorted image coordinates (u, v) = (x/z, y/z) of a ray to distorted
+    coordinates (p, q). Returns dp/du, dp/dv and dq/dv. The fourth derivative dq/du equals dp/dv.
     """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v

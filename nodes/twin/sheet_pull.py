@@ -93,9 +93,10 @@ class SheetPull:
 
     @classmethod
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
-        """Compute the tension of the true sheet with the membrane model.
+        """Create a model of the sheet's tension as a function of the distance between its edges.
 
-        Returns None if both arms are rigid, because then no flange is displaced.
+        The tension is computed with the membrane model for several distances. Returns None if both
+        arms are rigid, because the tension then does not displace the flanges.
         """
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
@@ -126,7 +127,10 @@ class SheetPull:
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Record the sheet's tension at an edge distance in the history of hysteresis and creep."""
+        """Add the present tension of the sheet to the history that determines hysteresis and creep.
+
+        distance_m: distance between the clamped edges.
+        """
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio

@@ -47,14 +47,15 @@ DEPTH_STEPS = 256
 class SheetReaction:
     """A table of the normal force (N) of the sheet on a finger.
 
-    The sheet is assumed to be symmetric.
+    The sheet is assumed to be symmetric about its centre lines. Positions are given by p distances
+    from the centre, as fractions of the width or height (POSITION_FRACTIONS).
 
-    width_m, height_m: dimensions of the sheet at rest, (1,).
+    width_m, height_m: width and height of the sheet at rest, each as an array with one element.
     stretches (s,): stretch ratios.
     depths_m (d,): depths in equal steps from 0.
     centre_n (s, d): force at the centre.
-    ratios (p, p, d): force divided by the force at the centre, at the p POSITION_FRACTIONS of the
-        width and of the height.
+    ratios (p, p, d): force at other positions, divided by the force at the centre. The first index
+        is the position along the width, the second along the height.
     """
 
     width_m: Floats

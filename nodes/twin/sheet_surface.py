@@ -98,8 +98,10 @@ class SagTable:
 def _compute_tension(stretch: Floats) -> Floats:
     """Return the normalized tension (n,) of a uniaxially stretched neo-Hookean sheet.
 
-    The product of sag and tension depends little on the stretch. Therefore interpolating this
-    product is accurate.
+    stretch: stretch ratios (n,).
+
+    The sag is almost inversely proportional to this tension. Therefore the product of both is
+    interpolated between stretch ratios.
     """
     return stretch - stretch**-2
 

@@ -28,7 +28,7 @@ and correct a larger deviation."""
 
 
 class Profile(StrEnum):
-    """The age of the laboratory's equipment.
+    """The two kinds of laboratory equipment for which the tolerance table contains data.
 
     MODERN: a 60 Hz camera with a short read-out, and robot controllers with a short period.
     PAPER: equipment as in Furukawa et al. 2007. The camera rate is 15 to 48 Hz, and its read-out
@@ -150,17 +150,17 @@ def _normal_cdf(sigmas: float) -> float:
 class Tolerance:
     """A row of the tolerance table: the distribution of one parameter of the simulated hardware.
 
-    key: dotted path in the apparatus (set of true parameters); "*" stands for both arms or both
-        lenses.
+    key: dotted path of the parameter; "*" stands for both arms or both lenses.
     unit, scale: unit in tables, and the factor from SI units to this unit.
-    modern: distribution of every component, or a tuple with one distribution per component.
+    modern: distribution for modern equipment. It applies to every component of a vector, unless it
+        is a tuple with one distribution per component.
     source, calibrated_source: literature or data sheet from which the numbers are taken.
-    paper: distribution for the profile `paper`; None if it equals `modern`.
+    paper: distribution for the equipment of Furukawa et al. 2007; None if it equals `modern`.
     calibrated: distribution after calibration; None if no calibration affects the parameter.
-    pair: distribution of the difference between each arm's value and a value that both arms share;
-        None if the values of both arms are independent.
-    frame_periods: profiles in which the distribution is given in periods of the true camera instead
-        of seconds.
+    pair: None if the values of both arms are independent. Otherwise the arms share a value, to
+        which each arm adds a value with this distribution.
+    frame_periods: kinds of equipment for which the unit of the distribution is the camera's frame
+        period instead of seconds.
     """
 
     key: str
@@ -352,10 +352,13 @@ def expand_key(key: str) -> tuple[str, ...]:
 def sample_apparatus(
     scene: Scene, seed: int, *, profile: Profile = Profile.MODERN, calibrated: bool = False
 ) -> Apparatus:
-    """Generate a random apparatus (true hardware parameters) for a scene.
+    """Generate random true parameters of the simulated hardware for a scene.
 
-    Equal arguments give equal results. For one seed, all profiles use the same random numbers, with
-    and without calibration. Therefore results can be compared in pairs.
+    profile: kind of laboratory equipment.
+    calibrated: whether the laboratory has calibrated its devices.
+
+    Equal arguments give equal results. All profiles use the same random numbers for one seed, with
+    and without calibration. Therefore results for one seed can be compared.
     """
     values = nominal_apparatus(scene).model_dump(mode="json")
     for row in TOLERANCES.values():
@@ -415,7 +418,7 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return a random generator for one parameter, independent of those of other parameters."""
+    """Return a random generator for one parameter, which does not depend on other parameters."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 

@@ -100,9 +100,11 @@ class TrueBody:
     def _on_skin(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
     ) -> tuple[Indices, Floats]:
-        """Return the indices (v, 3) and weights (v, 3) of three skin vertices per object vertex.
+        """Return the skin triangle that moves each vertex of the displayed object.
 
-        Both arrays are cached until the skin changes.
+        The skin is the surface mesh of the soft-body solver. For each of v object vertices, the
+        result contains the indices of the three corners (v, 3) and their interpolation weights (v,
+        3). It is cached until the skin changes.
         """
         key = skin_vertices.tobytes() + skin_triangles.tobytes()
         if self._skin is None or self._skin[0] != key:
@@ -125,8 +127,8 @@ class TrueBody:
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
     """Find the points of a mesh that are nearest to `points` (n, 3).
 
-    Returns the triangle corners (n, 3) and barycentric weights (n, 3) of the nearest points. Raises
-    ValueError if all triangles have zero area.
+    Each nearest point is given by the vertex indices of its triangle's corners (n, 3) and by
+    barycentric weights (n, 3). Raises ValueError if all triangles have zero area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):
@@ -176,7 +178,10 @@ def _fan(rim: Indices, centre: int) -> Indices:
 
 
 def _turned() -> Floats:
-    """Return unit vectors (AROUND, 3) perpendicular to the x axis, from +z towards +y."""
+    """Return AROUND unit vectors (AROUND, 3) at equal angles around the x axis.
+
+    The first vector is +z. The angle increases towards +y.
+    """
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     return np.column_stack([np.zeros(AROUND), np.sin(angle), np.cos(angle)])
 
@@ -218,7 +223,7 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return vertices, and the triangles that connect them to a closed surface.
+    """Return the vertices and the triangles of a closed surface around a centre.
 
     vertices (n, 3): one vertex in each direction that `_directions` returns, in the same order.
     """

@@ -1,7 +1,7 @@
 """Replace the assumed parameters of a scene by the true parameters of the simulated hardware.
 
-The scene describes the object, and the devices as the nodes assume them. The apparatus contains the
-deviations of the simulated devices from the scene.
+The scene contains the device parameters that the nodes assume. The apparatus contains the
+deviations of the simulated devices from these parameters.
 """
 
 from __future__ import annotations
@@ -45,10 +45,12 @@ class SimulatorParameters(NodeParameters):
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return the time (s) by which a frame is displayed later than the renderer assumes.
+    """Return by how much (s) a frame is displayed later than the renderer assumes.
 
-    The frame contains the latency that the renderer assumes. If no frame has been displayed, the
-    nominal latency is used. The result is 0 if there is no apparatus (true hardware parameters).
+    The assumed latency is the time from the buffer swap to the display, according to the times in
+    the frame. If no frame has been displayed, the nominal latency is used.
+
+    apparatus: true hardware parameters. If it is None, the result is 0.
     """
     if apparatus is None:
         return 0.0
@@ -59,11 +61,13 @@ def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> fl
 
 
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
-    """Return the scene with the true parameters of the devices.
+    """Return a copy of the scene with the true parameters of the devices.
 
-    If there is no apparatus, the scene is returned unchanged. Virtual objects and requirements are
-    unchanged. The returned camera has the lenses of its data sheet plus the offsets in the
-    apparatus. The function `make_true_camera` adds the deviations of the individual camera.
+    apparatus: deviations of the devices from the scene. If it is None, the scene is returned
+        unchanged.
+
+    Virtual objects and requirements do not change. The random deviations of an individual camera
+    are not included; the function `make_true_camera` adds them.
     """
     if apparatus is None:
         return scene
@@ -181,10 +185,10 @@ def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[fl
 def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
     """Express the true hardware parameters in the world frame that the stereo camera defines.
 
-    Calibrations define the world frame by the left camera. In this frame, the camera's pose in the
-    scene is exact. The original pose error of the camera becomes the inverse pose error of arms,
-    projector and eyes. The coordinates of the finger's path, the finger's tilt and gravity are
-    unchanged.
+    Calibrations define the world frame by the left camera. In this frame, the pose of the camera in
+    the scene is exact. Instead of the camera, the arms, the projector and the eyes have a pose
+    error, which is the inverse of the camera's original error. The coordinates of the finger's
+    path, the finger's tilt and gravity are unchanged.
     """
     nominal = apparatus.nominal or devices_of(scene)
     true_scene = apply_apparatus(scene, apparatus)

@@ -76,8 +76,8 @@ class Viewer:
     def align(self, side: Side, bead: Floats, sheet: DeformedSheet, time_s: float) -> Floats | None:
         """Return the point (3,) of the sheet, world frame, m, that an eye sees behind a bead.
 
-        The point contains a random alignment error. Returns None if the sheet is not behind the
-        bead.
+        The viewer aligns the bead with this point by sight, with a random error. Returns None if
+        the sheet is not behind the bead.
 
         bead (3,): position of the bead, world frame, m.
         """

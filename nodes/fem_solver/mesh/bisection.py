@@ -30,9 +30,11 @@ Cells = tuple[int, int, int]
 def make_lattice(below: Cells, above: Cells | None = None) -> tuple[Ints, Ints]:
     """Return vertices (n, 3) and tetrahedra (e, 4) of a lattice of cubic cells around the origin.
 
-    below, above: number of cells along each axis with negative and with positive coordinates. If
-    `above` is None, both numbers are equal. The planes x = 0, y = 0 and z = 0 are planes of
-    symmetry as far as both sides extend, and no tetrahedron has two boundary faces.
+    below, above: number of cells along each axis on the negative and on the positive side of the
+        origin. If `above` is None, both numbers are equal.
+
+    If the numbers along an axis are equal, the lattice is symmetric about the plane through the
+    origin perpendicular to this axis. No tetrahedron has two boundary faces.
     """
     ranges = (np.arange(-low, high) for low, high in zip(below, above or below, strict=True))
     cells = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -174,9 +174,9 @@ class _Sizes:
 def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> Floats:
     """Return the x coordinates (s,), m, of the cross-sections, including both ends of the cylinder.
 
-    If the sizes have a focus (a point near which the mesh is fine), one cross-section is at the
-    focus. Within the distance `near_m` of the focus, the spacing is uniform. If x = 0 is a plane of
-    symmetry, only values x >= 0 are returned.
+    If the mesh is fine only near a focus (pushed point), one cross-section is at the focus. Within
+    the distance `near_m` of the focus, the spacing is uniform. If x = 0 is a plane of symmetry,
+    only values x >= 0 are returned.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -207,11 +207,12 @@ def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _
 
 
 def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floats:
-    """Return increasing values whose spacing is the reciprocal of a density.
+    """Return increasing samples of a coordinate with a given number of samples per unit.
 
-    fine: increasing values that cover the range of the result. The result omits the end of the
-    range. density: required number of result values per unit, at each value of `fine`. min_count:
-    minimum number of result values.
+    fine: increasing coordinates at which the density is given. The samples begin at the first
+        coordinate and end before the last.
+    density: number of samples per unit of the coordinate, at each value of `fine`.
+    min_count: minimum number of samples.
     """
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
     pieces = max(min_count, round(float(total[-1])))
@@ -237,7 +238,10 @@ def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
 def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
     """Return the points (n, 2), as (y, z), m, and the triangles (t, 3) of a cross-section.
 
-    The triangles are counter-clockwise as seen from +x. Two points are at the ends of the support.
+    half_support: half the angle (rad) of the arc on which the cylinder is fixed. Two points are at
+        the ends of this arc.
+
+    The triangles are counter-clockwise as seen from +x.
     """
     free = np.pi - half_support
     ends = [-free, free, 2 * np.pi - free]
@@ -263,12 +267,16 @@ def _focused_disc(
     focus: Focus,
     mirror_axes: tuple[int, ...],
 ) -> tuple[Floats, Ints]:
-    """Return the points (n, 2) and the triangles (t, 3) of a cross-section that is fine at a focus.
+    """Return a mesh of the cross-section that is fine near the pushed point.
 
-    The cross-section is symmetric about the diameter through the focus, except at the ends of the
-    support. In an asymmetric mesh, the force on the finger would have a sideways component of a few
-    percent of its magnitude. If y = 0 is a plane of symmetry, only the half with y >= 0 is
-    returned.
+    half_support: half the angle (rad) of the arc on which the cylinder is fixed.
+    focus: pushed point.
+    mirror_axes: axes of the planes of symmetry. If 1 is among them, only the half with y >= 0 is
+        returned.
+
+    Returns the points (n, 2), m, and the triangles (t, 3). The mesh is symmetric about the diameter
+    through the pushed point, except at the ends of the fixed arc. In an asymmetric mesh, the force
+    on the finger would have a sideways component of a few percent.
     """
     near = focus.near_m / radius_m
     inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
@@ -307,8 +315,12 @@ def _circle(radius: float | Floats, angles: Floats) -> Floats:
 def _triangles(points: Floats, where: Floats) -> Ints:
     """Triangulate points, and return counter-clockwise triangles (t, 3) of point indices.
 
-    points (n, 2): positions that determine the orientation of the triangles. where (n, 2): similar
-    positions from which the Delaunay triangulation is computed. Flat triangles are omitted.
+    points (n, 2): positions of the points, which determine the orientation and area of the
+        triangles.
+    where (n, 2): positions that are used for the Delaunay triangulation. They may differ slightly
+        from `points`, so that the triangulation is unique.
+
+    Triangles without area are omitted.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
@@ -324,9 +336,13 @@ def _triangles(points: Floats, where: Floats) -> Ints:
 def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[Floats, Ints]:
     """Extrude a cross-section, and return corner nodes (k, 3) and tetrahedra (e, 4).
 
-    points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the s cross-sections, m.
-    swapped: index of a slice that is divided as if its ends were swapped, as is every second slice
-    before and after it. Therefore the mesh has no preferred direction.
+    points (n, 2), triangles (t, 3): cross-section.
+    x (s,): positions of the s cross-sections, m.
+    swapped: index of a slice between two cross-sections.
+
+    Each slice consists of prisms, which are divided into tetrahedra. In the slice `swapped` and in
+    every second slice before and after it, the division is mirrored along x. Otherwise the mesh
+    would be stiffer in some directions than in the mirrored directions.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])

@@ -69,10 +69,10 @@ class _SurfaceCache:
         return self.origin + vertices * (self.cell_m / CELL)
 
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
-        """Return signed distances (n,), m, surface normals (n, 3) and surface curvatures (n,), 1/m.
+        """Return the signed distances of lattice vertices (n, 3) from the surface.
 
-        A signed distance is the distance of a lattice vertex from the surface. Normals and
-        curvatures are evaluated at the surface points nearest to the vertices.
+        Returns three arrays: signed distances (n,), m, surface normals (n, 3) and surface
+        curvatures (n,), 1/m. The normals and curvatures are those of the nearest surface points.
         """
         keys = [vertex.tobytes() for vertex in vertices]
         new = [i for i, key in enumerate(keys) if key not in self._row_numbers]
@@ -137,8 +137,9 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
 def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
     """Limit element sizes (n,), m, to `CURVATURE_SIZE_RATIO` times the radius of curvature.
 
-    bend (n,): surface curvature at each element, 1/m. grading: required element sizes, which
-    determine the lower bound of the result.
+    bend (n,): surface curvature at each element, 1/m.
+    grading: element sizes of the mesh. The limit is at least `MIN_SIZE_RATIO` times the minimum
+        size in `grading`.
     """
     finest = np.maximum(
         CURVATURE_SIZE_RATIO / np.maximum(bend, 1e-9), MIN_SIZE_RATIO * grading.element_m
@@ -161,7 +162,11 @@ def hull_faces(tetrahedra: Ints) -> Ints:
 def _cover_with_lattice(
     field: _SurfaceCache, half_m: Floats, grading: Grading
 ) -> tuple[Ints, Ints]:
-    """Return vertices (n, 3) and tetrahedra (e, 4) of a bisected lattice that covers the solid."""
+    """Return a lattice of tetrahedra that covers the solid, refined to the required element sizes.
+
+    Returns vertices (n, 3), in integer coordinates, and tetrahedra (e, 4). Tetrahedra that are too
+    large are bisected.
+    """
 
     def too_large(vertices: Ints, tetrahedra: Ints) -> Bools:
         distance, normals, bend = field.at(vertices)

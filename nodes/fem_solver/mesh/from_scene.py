@@ -234,8 +234,8 @@ def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
 def build_mesh(spec: MeshSpec, grading: Grading | None = None) -> SolidMesh:
     """Build the mesh that a specification describes, in the mesh frame (`world_from_mesh`).
 
-    grading: element sizes of an object that is no cylinder; if it is None, those of the
-    specification are used.
+    grading: element sizes; None means the element sizes in the specification. For a cylinder, the
+        argument is ignored.
 
     Raises UnfitMeshError if the skin spacing does not fit the object or requires more than
     `MAX_NODES` nodes. It is also raised if the object is too thin for the elements, or if the
@@ -317,7 +317,7 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 def _require_fixed_back(spec: MeshSpec, fixed: Bools, normals: Floats) -> None:
     """Raise UnfitMeshError unless the whole back of the slab that represents a half-space is fixed.
 
-    A slab that is fixed in a part of its back only bends, and is far softer than a half-space.
+    A slab with a partly fixed back bends, and is therefore far softer than a half-space.
     """
     back = normals[:, 2] < 0.0
     if not fixed[back].all():

@@ -40,9 +40,11 @@ class Grading:
     """The element sizes of a mesh.
 
     Skin can be touched if the angle between its normal and the unit vector `towards_user` is at
-    most `touch_angle_rad`. The nodes of touchable skin are `skin_spacing_m` apart. Elements
-    elsewhere are larger. fine_point: point near which alone the nodes have this spacing; if it is
-    None, all touchable skin has this spacing.
+    most `touch_angle_rad`.
+
+    skin_spacing_m: distance between the nodes of touchable skin. Elements elsewhere are larger.
+    fine_point: surface point. If it is given, only the skin near this point has the spacing
+        `skin_spacing_m`.
     """
 
     skin_spacing_m: float

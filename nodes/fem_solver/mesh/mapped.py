@@ -130,12 +130,15 @@ the mapped points (n, 3), m, and the required element sizes (n,), m."""
 def _map_lattices(
     below_m: Floats, above_m: Floats, element_m: float, positions: MapFunction
 ) -> list[tuple[Floats, Ints, Bools]]:
-    """Return several mapped lattices, sorted by their number of elements.
+    """Return meshes of tetrahedra with different resolutions, sorted by their number of elements.
 
-    The lattices initially have cells of different sizes. They are bisected where smaller elements
-    are required. A lattice consists of corners (n, 3), tetrahedra (e, 4), and flags (n,) for
-    corners on the boundary. below_m, above_m (3,): extents of the negative and of the positive
-    sides. element_m: minimum element size. positions: function that maps the vertices.
+    A mesh is made from a cubic lattice. Its cells are bisected where smaller elements are required,
+    and its vertices are mapped to the solid. A mesh consists of corners (n, 3), tetrahedra (e, 4),
+    and flags (n,) for corners on the boundary.
+
+    below_m, above_m (3,): extents of the negative and of the positive sides.
+    element_m: minimum element size.
+    positions: function that maps vertices, and returns the required element sizes there.
     """
     found: list[tuple[Floats, Ints, Bools]] = []
     for cells in COARSENINGS:

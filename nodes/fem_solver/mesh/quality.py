@@ -61,10 +61,9 @@ def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
     """Return a lower bound (e,) of the minimum Jacobian ratio of each 10-node tetrahedron.
 
     The ratio is the Jacobian determinant, divided by that of the tetrahedron with straight edges.
-    The determinant is a cubic polynomial, which is bounded by its Bernstein coefficients. Each
-    coefficient belongs to three corners. It is the mean determinant of the position derivatives at
-    the corners, over all permutations of these corners. Source: Johnen, Remacle, Geuzaine,
-    "Geometrical validity of curvilinear finite elements", 2013.
+    The determinant is a cubic polynomial in the barycentric coordinates. It is at least as large as
+    its smallest Bernstein coefficient. Source: Johnen, Remacle, Geuzaine, "Geometrical validity of
+    curvilinear finite elements", 2013.
     """
     points = nodes[elements]
     slopes = np.empty((len(elements), 4, 4, 3))

@@ -49,11 +49,18 @@ def smooth_mesh(
 ) -> Floats:
     """Improve the shape of tetrahedra, and return the new positions (n, 3), m, of their corners.
 
-    corners (n, 3): corner positions, m. tetrahedra (e, 4): corner indices, ordered for positive
-    volumes. hull: indices of the corners that move to the surface of `shape`. springs: spring
-    stiffness in each round. anchor: stiffness of springs from each corner to its initial position.
-    These springs preserve the variation of element sizes. If an element would have a radius ratio
-    below `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
+    Each round minimizes a measure of distortion plus the energy of springs. Springs pull the
+    boundary corners onto the surface, and pull all corners to their initial positions.
+
+    corners (n, 3): corner positions, m.
+    tetrahedra (e, 4): corner indices, ordered for positive volumes.
+    hull: indices of the boundary corners, which move to the surface of `shape`.
+    springs: stiffness of the springs to the surface, one value for each round.
+    anchor: stiffness of the springs to the initial positions. They preserve the variation of
+        element sizes.
+
+    Finally, the boundary corners are moved exactly onto the surface. If this would give an element
+    a radius ratio below `MIN_FINAL_RADIUS_RATIO`, its corners are not moved.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))

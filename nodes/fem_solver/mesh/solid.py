@@ -159,12 +159,14 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
 def make_solid_mesh(
     nodes: Floats, elements: Ints, *, touchable: Bools, fixed: Bools, normals: Floats
 ) -> SolidMesh:
-    """Sort the nodes by slab, find the skin and its touchable part, and return the mesh.
+    """Make a mesh with marked skin from nodes (n, 3), m, and elements (e, 10).
 
-    touchable, fixed (n,): whether each node can be touched, and whether it is fixed. normals
-    (n, 3): outward normals at touchable nodes. A face is touchable if all its nodes are touchable
-    and none is fixed. Raises UnfitMeshError if no face is touchable, or if the mesh consists of
-    several components.
+    touchable, fixed (n,): whether each node can be touched, and whether it is fixed.
+    normals (n, 3): outward normals at touchable nodes.
+
+    A face is touchable if all its nodes are touchable and none is fixed. The nodes are sorted along
+    the longest axis of the mesh. Raises UnfitMeshError if no face is touchable, or if the mesh
+    consists of several components.
     """
     level = number_slabs(nodes, elements)
     order = np.lexsort((nodes[:, 2], nodes[:, 1], nodes[:, 0], level))

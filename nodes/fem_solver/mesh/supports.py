@@ -1,4 +1,4 @@
-"""Select the skin nodes that the support described in a scene fixes."""
+"""Select the skin nodes that are fixed by the support in a scene."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Describe each kind of geometry in one table, `GEOMETRIES`.
 
-The functions in a description receive an object whose attributes are the dimensions of the
-geometry. Examples are `scene.object.geometry` and the shape itself. A new kind of geometry needs a
-shape class and a description in the table.
+A description contains functions that compute properties from the dimensions of a geometry. They
+read the dimensions as attributes, either of the geometry in a scene or of a shape. To add a new
+kind of geometry, define a shape class and add a description to the table.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class CuboidMap:
     """A map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
 
     half_m: half extents (3,) of the solid.
-    inner_m: half extents (3,) of the undistorted lattice of the mesh.
+    inner_m: half extents (3,) of the inner part of the mesh, which is an undistorted lattice of
+        cells.
     surface: function that maps points (n, 3) on the cube to points (n, 3), in m, on the solid.
     is_round: whether the whole surface is curved, as on an ellipsoid; false if it has flat faces.
     """
@@ -56,8 +57,9 @@ class GeometryDescription:
     extent_m: function that returns how far (m) the touchable surface extends from the origin along
         a unit vector.
     scale: function that returns the dimensions multiplied by a ratio.
-    cuboid_map: function that returns the map for meshing; None if the shape is meshed by another
-        method. The arguments are the dimensions and the shape.
+    cuboid_map: function that returns the map from a cube to the solid, by which the solid is
+        meshed. The arguments are the dimensions and the shape. None means that another method
+        meshes the solid.
     """
 
     make_shape: Callable[..., Shape]
@@ -68,14 +70,19 @@ class GeometryDescription:
 
 
 def map_round_solid(half_m: Floats) -> CuboidMap:
-    """Return the map for meshing an ellipsoid with half extents (3,), m, centred on the origin."""
+    """Return the map from a cube to an ellipsoid that is used to mesh the ellipsoid.
+
+    half_m: half extents (3,) of the ellipsoid, which is centred on the origin, m.
+    """
     return CuboidMap(half_m, INNER_RATIO * half_m, lambda w: half_m * cube_to_sphere(w), True)
 
 
 def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
-    """Return a map for meshing, from the surface of a box to the nearest points on `shape`.
+    """Return the map from a cube to a solid that is used to mesh the solid.
 
-    half_m (3,): half extents of the box.
+    Each point of the cube's surface, scaled to a box, is mapped to the nearest point on `shape`.
+
+    half_m (3,): half extents of the box, m.
     """
     return CuboidMap(half_m, half_m, lambda w: shape.closest(half_m * w).point, False)
 

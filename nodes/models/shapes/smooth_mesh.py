@@ -261,13 +261,14 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _find_global_nearest(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """Return the points globally nearest to queries (n, 3), and whether each is ambiguous.
+        """Return the surface points nearest to queries (n, 3), and whether each is ambiguous.
 
-        A jet is a local quadratic fit of the surface. The projection of each query starts at the
-        nearest jet, and gives a point at a distance D. Each point of the surface has a jet within
-        the distance c (`_cover`). The radius of curvature is at least rho (`smoothing_m`).
-        Therefore the jet of a nearer point is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the
-        query. Further projections start from selected jets within this distance.
+        The surface is represented by local quadratic fits, called jets. Newton's method first
+        projects each query to the surface from the nearest jet. The found point has the distance D
+        from the query. A jet near a closer surface point is at most sqrt(D^2 + c^2 (1 + 4 D / rho))
+        from the query. Here c is the maximum distance of a surface point from the nearest jet. The
+        smoothing length rho limits the curvature. Newton's method is repeated from selected jets
+        within this distance.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
@@ -305,13 +306,14 @@ class SmoothMeshShape:
     ) -> tuple[Indices, Indices]:
         """Choose further starting points for the search for a nearer surface point.
 
-        lists: indices of the candidate jets (local quadratic fits) of each query.
-        feet (n, 3), distance (n,): nearest points found before, and their distances, m.
+        lists: for each query, indices of the candidate jets (local quadratic fits of the surface).
+        feet (n, 3), distance (n,): surface points found before, and their distances from the
+            queries, m.
 
-        Return the starting points as k pairs of a query and a jet: query indices (k,) and jet
-        indices (k,). A jet is chosen if the nearest point on its quadratic is close to the jet and
-        not much farther than `distance`. A jet is omitted if its distance from `feet` or from a
-        chosen jet is below the smoothing length.
+        Returns k pairs of a query and a jet, as query indices (k,) and jet indices (k,). A jet is
+        chosen only if its quadratic can contain a point nearer to the query than `distance`. A jet
+        is omitted if the surface point found before, or a chosen jet, is within the smoothing
+        length.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -362,7 +364,7 @@ class SmoothMeshShape:
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
         """Return the maximum height (m) of the object above its tangent plane at a surface point.
 
-        This implements `Shape.rise_m`. The height is evaluated only at the centres of the jets.
+        The height is evaluated only at the centres of the local quadratic fits of the surface.
         """
         offset = self._centre[:-1] - point
         height = offset @ normal
@@ -374,9 +376,9 @@ class SmoothMeshShape:
         return float((height[within] * np.minimum(weight, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
-        """Return points (n, 3) on jets that are approximately nearest to queries (n, 3).
+        """Return points (n, 3) on local quadratic fits, approximately nearest to queries (n, 3).
 
-        jet (n,): index of the jet (local quadratic fit) for each query.
+        jet (n,): index of the quadratic fit for each query.
         """
         normal, operator = self._normal[jet], self._operator[jet]
         offset = queries - self._centre[jet]
@@ -391,13 +393,13 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """List the jets (local quadratic fits) that have weight in the neighbourhood of each jet.
+        """List the local quadratic fits (jets) that influence the surface near each jet.
 
-        cover (j,): radius (m) of the neighbourhood of each jet.
+        cover (j,): radius (m) of the considered neighbourhood of each jet.
 
-        Return a table (j, k) of jet indices, and the number (j,) of valid entries in each row. Rows
-        are padded with the index of an additional jet that has no influence. This method appends
-        that jet.
+        Returns a table (j, k) of jet indices, and the number (j,) of valid entries in each row.
+        Rows are padded with the index of an additional jet that has no influence. This method
+        appends that jet.
         """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
@@ -411,10 +413,10 @@ class SmoothMeshShape:
         return table, counts
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate f at points (n, 3) near the surface. This implements a `LevelSet`.
+        """Evaluate the implicit function whose zero level set is the surface, at points (n, 3).
 
-        Return the values (n,), gradients (n, 3) and Hessians (n, 3, 3) of f, and the sums (n,) of
-        the jets' weights.
+        Returns the values (n,), gradients (n, 3) and Hessians (n, 3, 3) of the function. A fourth
+        result is the sum (n,) of the weights of the local quadratic fits at each point.
         """
         nearest = self._tree.query(points)[1]
         members = self._table[nearest, : self._counts[nearest].max()]
@@ -454,10 +456,11 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """Return the index of the jet (local quadratic fit) nearest to a point (3,), and k jets.
+        """Return the local quadratic fits (jets) of the surface around a point (3,).
 
-        The k jets have weight near the point. They are returned as indices (k,), centres
-        (k, 3), normals (k, 3) and shape operators (k, 3, 3).
+        The first result is the index of the nearest jet. The other results describe the k jets that
+        may have a weight above zero near the point: indices (k,), centres (k, 3), normals (k, 3)
+        and shape operators (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -471,10 +474,11 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """The level set f of a mesh, as a function (`LevelAt`) for the projection of one query.
+    """The implicit function of a smoothed mesh, for the projection of one query to the surface.
 
-    To save time, the list of nearby jets is updated only when the point has moved by
-    `MEMBERS_KNOWN` times `rho`.
+    The function is a weighted mean of local quadratic fits, and is zero on the surface. To save
+    time, the list of nearby fits is updated only after a motion of `MEMBERS_KNOWN` times the
+    smoothing length.
     """
 
     __slots__ = ("_jets", "_jets_point", "_shape")
@@ -517,9 +521,10 @@ class _LevelNear:
 
 
 def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
-    """Set `is_nearest` to false for projections that ended beyond the rim of a thin part.
+    """Mark projections as invalid if they ended beyond the rim of a thin part of the mesh.
 
-    Beyond a rim, the points with f = 0 do not represent the surface of the mesh.
+    The attribute `is_nearest` is set to false. Beyond the rim, the implicit function can be zero at
+    points that are not on the mesh.
     """
     beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
     feet.is_nearest[beyond_rim | (feet.support < MIN_SUPPORT)] = False

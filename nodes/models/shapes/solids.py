@@ -186,7 +186,8 @@ class EllipsoidShape(Convex):
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Evaluate a quadratic function of points (n, 3) that is zero on the ellipsoid.
 
-        The results are those of a `LevelSet`.
+        Returns values (n,), gradients (n, 3), Hessians (n, 3, 3), and the number 1 for each point.
+        The number means that the function is valid everywhere.
         """
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
@@ -199,8 +200,9 @@ class EllipsoidShape(Convex):
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
         """Evaluate a quadratic function of one point (3,) that is zero on the ellipsoid.
 
-        Return its value, gradient and Hessian, and the support 1. Python numbers are used for
-        speed; `_level` evaluates the same function for arrays of points.
+        Returns the value, the gradient, the Hessian and the number 1, which means that the function
+        is valid everywhere. Python numbers are used for speed. The method `_level` evaluates the
+        same function for arrays of points.
         """
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
@@ -261,8 +263,8 @@ class RoundedBoxShape(Convex):
     size_m: full extents along x, y and z, including the rounding.
     edge_radius_m: radius of edges and corners, at most half of the smallest extent.
 
-    The normal is continuous along the surface, but the curvature is not. The core is the box that
-    contains the centres of curvature of all edges and corners.
+    The shape contains all points within `edge_radius_m` of a smaller box, which is called the core.
+    The normal is continuous along the surface, but the curvature is not.
     """
 
     size_m: tuple[float, float, float]
@@ -324,14 +326,16 @@ class RoundedBoxShape(Convex):
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Return the face of the core that is nearest to each query (n, 3) inside the core.
+        """Return the nearest face of the core (inner box) for each query (n, 3) inside the core.
 
-        before: previous nearest points (n, 3), or None if there are none. Only faces that contain
-            these points are considered. If there are none and several faces are equally near, the
-            first face in the order z, y, x, -z, -y, -x is chosen.
+        before: previous nearest points (n, 3) on the rounded box; None if there are none. Only the
+            faces next to a previous point are considered.
 
-        Return four arrays (n,): axis and sign of the face's normal, distance from the face, m, and
-        whether the choice is ambiguous.
+        If several faces are equally near, the first face in the order z, y, x, -z, -y, -x is
+        chosen.
+
+        Returns four arrays (n,): axis of the face's normal, sign of the normal, distance from the
+        face (m), and whether several faces are equally near.
         """
         core = self._core()
         # Columns z, y, x, -z, -y, -x.
@@ -358,11 +362,14 @@ def _outer(normal: Floats) -> Floats:
 def _directions(
     offsets: Floats, previous: ArrayLike | None, queries: Floats, *, across: tuple[int, ...]
 ) -> tuple[Floats, Floats, Bools]:
-    """Return unit directions and lengths of offsets (..., 3), and whether each offset is zero.
+    """Return unit directions and lengths of vectors (..., 3), and whether each vector is zero.
 
-    across: indices of the coordinates in which the offsets can differ from zero. If an offset is
-        zero, its direction is the direction from the origin to the previous point, or `FRONT` if
-        there is no previous point.
+    offsets: vectors from an axis or centre of a solid to queries.
+    previous: previous nearest points of the queries, or None.
+    across: indices of the coordinates in which the vectors can differ from zero.
+
+    A zero vector has no direction. Instead, the direction to the previous nearest point is
+    returned, or `FRONT` if there is none.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)

@@ -36,17 +36,18 @@ points to the user.
 
 @dataclass(frozen=True, slots=True)
 class Nearest:
-    """The touchable surface points that are nearest to queries.
+    """The touchable surface points that are nearest to given points (queries).
 
     point (..., 3), normal (..., 3): nearest point, m, and unit normal at this point.
     height_m: height (...) of the query above the tangent plane at `point`, negative below this
-        plane. The height equals the signed distance, unless the query is beyond the rim of the
+        plane. It equals the signed distance, unless the query is beyond the edge of the touchable
         surface.
     shape_operator: shape operator (..., 3, 3) at `point`, 1/m.
-    on_edge: whether `point` is on an edge of a mesh, or whether the query is beyond the rim of the
+    on_edge: whether `point` is on an edge of a mesh, or whether the query is beyond the edge of the
         touchable surface. A sheet can touch such a point but cannot roll over it.
-    undecided: whether another surface point is equally near. Then the previous point or `FRONT`
-        determines the choice.
+    undecided: whether another surface point is equally near. In this case, the point nearer to the
+        previous result is returned. Without a previous result, the constant direction `FRONT`
+        decides.
     """
 
     point: Floats
@@ -75,10 +76,8 @@ class Shape(Protocol):
         """Find the touchable surface points that are nearest to `points`.
 
         previous: nearest points of the previous queries, with the shape of `points`; None if the
-            contact is new. If previous points are given, the results are continuous over time. The
-            search then returns the local minimum of the distance that continues the previous point,
-            as long as this minimum exists. Another surface point can be equally near. Inside the
-            object, another point can even be nearer.
+            contact is new. The search then follows each point continuously, even if another surface
+            point is equally near. Inside the object, another point can even be nearer.
 
         Raises ValueError if a coordinate is not finite or exceeds `MAX_QUERY_M`, or if the shape of
         the array is neither (3,) nor (n, 3).
@@ -199,12 +198,13 @@ support is a measure of the validity of f at a point, and is 0 far away from the
 
 @dataclass(frozen=True, slots=True)
 class SurfaceProjections:
-    """The results of the projection of n queries onto a surface.
+    """The results of the projection of n queries onto a surface that an implicit function defines.
 
     point, normal (n, 3): surface points, m, and unit normals.
     shape_operator (n, 3, 3): shape operators, 1/m.
-    steepness (n,): length of the gradient of the `LevelSet`.
-    support (n,): support of the `LevelSet` at each point.
+    steepness (n,): length of the gradient of the implicit function.
+    support (n,): measure of the validity of the implicit function at each point; 0 far away from
+        the surface.
     is_nearest (n,): whether the projection converged to a local minimum of the distance.
     """
 

@@ -361,7 +361,7 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return whether (n,) each line segment passes through the interior of its triangle.
+    """Return for each of n line segments whether it passes through the interior of its triangle.
 
     start, end (n, 3): end points of the segments.
     corners (n, 3, 3): one triangle for each segment.

@@ -1,11 +1,11 @@
 """Compute the force of the pushed sheet with interchangeable models.
 
-A model receives depths of a fingertip below the flat sheet, and a `SheetPush`. This contains the
-stretch ratio, the position on the stretched sheet (x and y from the sheet's centre, m) and the
-fingertip's radius. A model returns the normal force, its derivative with respect to depth, and the
-force on each clamp.
+The inputs of a model are depths of a fingertip below the flat sheet, and a `SheetPush`. A
+`SheetPush` contains the stretch ratio, the fingertip's radius, and the position on the stretched
+sheet (x and y from the sheet's centre, m). The outputs are the normal force, its derivative with
+respect to depth, and the force on each clamp.
 
-In order of increasing computing time, the models are `ScaledSheetModel`,
+There are three models. From the fastest to the slowest, they are `ScaledSheetModel`,
 `nodes.models.sheet.tabulated.TabulatedSheetModel` and `MembraneSheetModel`.
 """
 
@@ -62,7 +62,7 @@ class SheetForce:
 
 
 class SheetForceModel(Protocol):
-    """The interface of models of the force on a sheet that a fingertip pushes."""
+    """The interface of models that compute the force of the sheet on a fingertip that pushes it."""
 
     @property
     def name(self) -> str: ...

@@ -104,9 +104,12 @@ class IndentationBasis:
         return np.asarray(shape)
 
     def grid(self, stretch_ratio: float, position_m: tuple[float, float]) -> Floats:
-        """Return the grid points (rows, columns, 2), m, on the flat sheet that `offsets` displaces.
+        """Return the grid points (rows, columns, 2), m, of the flat sheet before it is pushed.
 
-        position_m: (x, y) of the fingertip in the sheet frame.
+        position_m: (x, y) of the fingertip in the sheet frame. The grid is finer near this
+            position.
+
+        The method `offsets` returns the displacements of these points.
         """
         sheet, most_x, most_y = self.rubber, self.xs_m[-1], self.ys_m[-1]
         focus_x = float(np.clip(position_m[0], -most_x, most_x)) / stretch_ratio

@@ -293,7 +293,9 @@ class _Grid:
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return larger and smaller eigenvalues (n,) of tensors C (n, 2, 2), and directions (n, 2).
+    """Return the larger eigenvalues (n,), the smaller eigenvalues (n,) and directions (n, 2).
+
+    c (n, 2, 2): symmetric tensors.
 
     The directions are the unit eigenvectors of the larger eigenvalues.
     """
@@ -347,8 +349,9 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
     c (n, 2, 2): Cauchy-Green tensors.
     c1, c2: material constants, Pa.
-    tangent: whether the tangent is computed; if false, it is empty. The rows and columns of the
-        tangent belong to the strains [E11, E22, 2 E12].
+    tangent: whether the tangent is computed. If false, an empty array is returned instead.
+
+    The rows and columns of the tangent belong to the strains [E11, E22, 2 E12].
     """
     large, small, direction = principal(c)
     _, first, second = relaxed_energy(large, small, c1, c2)
@@ -405,7 +408,9 @@ class _FingerContact:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium by scaling the current deflection; start with a cone.
+    """Predict the equilibrium at the next push depth, as the initial guess of the solver.
+
+    The current deflection is scaled with the depth. If the depth is 0, the prediction is a cone.
 
     push: current depth and its increase in this step (m).
     """

@@ -95,14 +95,21 @@ class TabulatedSheetModel:
         )
 
     def _ratios_of(self, push: SheetPush) -> Floats:
-        """Return the interpolated ratios (b,) for a push at the b depths of the table."""
+        """Return the table's force ratios (b,) for a push, at the b depths of the table.
+
+        A ratio is the sheet's force divided by the force of the closed-form model `base`. The
+        ratios are interpolated between stretch ratios and positions.
+        """
         x, y = map(abs, push.position_m)
         ratios = _interpolate_linear(self.stretches, push.stretch_ratio, self.ratios)
         ratios = _interpolate_linear(self.xs_m, x, np.moveaxis(ratios, 1, 0))
         return _interpolate_linear(self.ys_m, y, np.moveaxis(ratios, 1, 0))
 
     def _ratio_curve(self, push: SheetPush) -> tuple[Curve, Curve]:
-        """Return a push's ratio as a function of the depth, and the derivative of this function."""
+        """Return the force ratio of a push as a function of the depth, and its derivative.
+
+        The ratio is the sheet's force divided by the force of the closed-form model `base`.
+        """
         if push not in self._curves:
             if len(self._curves) >= MAX_CURVES:
                 self._curves.clear()

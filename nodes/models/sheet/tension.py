@@ -1,4 +1,4 @@
-"""Compute the edge force and the sag of an untouched sheet, and the stiffness of small pushes."""
+"""Compute the edge force, the sag, and the stiffness at small deflections of a sheet."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
 
 
 def edge_force_for_stiffness(stiffness_n_per_m: float, *, width_m: float) -> float:
-    """Return the edge force (N) at which a small push at the centre has a given stiffness."""
+    """Return the edge force (N) for a required stiffness at small deflections of the centre."""
     return stiffness_n_per_m * width_m / PUSH_FACTOR
 
 
