@@ -123,9 +123,9 @@ TwinApparatusOption = Annotated[
 
 
 def _run_option(default: str) -> Any:
-    """Return the option --run.
+    """Return the option --run, which selects a running graph by its run directory.
 
-    default: text that states which graph is used without the option.
+    default: text for the help that states which graph is used if the option is not given.
     """
     return typer.Option(
         "--run",

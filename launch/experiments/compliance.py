@@ -469,7 +469,7 @@ def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | Non
     """Return the mean force (N) that a force gauge measured while the finger rested.
 
     Return None if there are no measurements. The force is averaged over the last MEASURED_S of the
-    rest. The true force is averaged over a shorter time, but gauges respond slowly.
+    rest. This time is long because gauges respond slowly.
 
     forces: array (k, 2) of k times (ns) and forces (N).
     begin_ns: start of the finger path.

@@ -219,7 +219,10 @@ class RolledSheet:
 
 
 class FollowedContact:
-    """A model of a sheet that exactly follows a finger, and of small deviations from its path."""
+    """A model of a sheet that follows a finger exactly, or with small deviations of its position.
+
+    It computes the heights of the contact and the motions of the arms.
+    """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))

@@ -160,9 +160,9 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return the risk of the control loop of sheet and hand at a given delay.
+    """Return the risk that the sheet oscillates or renders a wrong force at a given delay.
 
-    Return None if there is no risk.
+    Return None if there is no risk. Sheet and hand form a control loop, which a delay destabilizes.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.

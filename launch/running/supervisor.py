@@ -976,7 +976,7 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
         if not is_loopback(address) and not plan.keys:
             raise read_launch_file(Path(plan.launch_file)).error(
                 ("hosts", name, "address"),
-                f"{address} is not a loopback address, but the hosts have no keys",
+                f"connections to {address} must be encrypted, but the hosts have no keys",
                 f"create a key on each host (flexsheet keys new {name}) and install all "
                 f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
             )

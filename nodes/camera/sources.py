@@ -30,7 +30,9 @@ class OpenCvSource(CameraSource):
     Two cameras without a common trigger expose at different times (`docs/camera.md`).
     """
 
-    kind: Literal["live", "opencv"] = Field(description="opencv is the former name of live")
+    kind: Literal["live", "opencv"] = Field(
+        description="live: images of real cameras. opencv: former name of the value live"
+    )
     left: int | DeviceFile = Field(
         description="left camera, or camera with both views side by side: number, path or address; "
         "aravis: name of the camera; realsense: serial number, or empty; gstreamer: pipeline"

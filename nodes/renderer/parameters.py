@@ -73,8 +73,8 @@ class RendererParameters(NodeParameters):
     )
     sheet_shape: SheetShapeMethod | Literal["auto"] = Field(
         default="auto",
-        description="Method that computes the sheet's shape for two_pass. auto: the method that "
-        "the scene specifies is used, or reduced_order if the scene specifies none.",
+        description="Method that computes the sheet's shape for the correction method two_pass. "
+        "auto: the method of the scene, or reduced_order if the scene specifies none.",
     )
     cache_dir: Path | None = Field(
         default=None,

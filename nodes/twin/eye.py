@@ -433,8 +433,8 @@ def _ends(profile: Floats) -> tuple[float, float]:
     bright = np.nonzero(profile > 0.5)[0]
     if len(bright) < 12:
         raise NotMeasurableError(
-            f"the object covers only {len(bright)} pixels of a measured line of the eye's image; "
-            "at least 12 are required"
+            f"the object is only {len(bright)} pixels wide in the eye's image; at least 12 pixels "
+            "are required to measure its edges"
         )
     return _edge(profile, bright[0]), len(profile) - 1 - _edge(
         profile[::-1], len(profile) - 1 - bright[-1]
@@ -516,7 +516,10 @@ class EyeSituation:
 
 
 class EyeCamera:
-    """A simulated measuring camera at the user's eye. It caches the expected image."""
+    """A simulated camera at the user's eye that measures errors of the displayed image.
+
+    It caches the image that a perfect display would show.
+    """
 
     def __init__(self) -> None:
         self._scene: Scene | None = None

@@ -124,11 +124,11 @@ class Sensor:
         return float(np.sqrt(self.blur_px**2 + defocus_px**2 + 1.0 / 12.0))
 
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
-        """Return a copy of the sensor that blurs points at the depth `depth_m` by defocus.
+        """Return a copy of the sensor whose focus is behind points at the depth `depth_m`.
 
-        defocus_px: standard deviation of the blur by the defocus alone.
+        defocus_px: standard deviation of the blur that the defocus alone causes at this depth.
 
-        Raises ValueError if even a focus at infinity gives less blur.
+        Raises ValueError if the aperture is too small for this blur.
         """
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
