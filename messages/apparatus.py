@@ -92,7 +92,10 @@ class CameraTruth(Part):
 
 
 class ArmTruth(Part):
-    """The deviations of a simulated arm from the scene, and the behaviour of its controller."""
+    """The deviations of a simulated arm from its description in the scene file.
+
+    The behaviour of the arm's controller is also described.
+    """
 
     base_position_offset_m: SmallTriple = ZERO_3
     base_rotation_offset_rad: SmallTriple = ZERO_3

@@ -618,7 +618,7 @@ class SelfCheck(MessagePart):
     value: Finite = Field(description="measured value, averaged over several seconds")
     expected: Finite = Field(description="value if everything is as assumed")
     threshold: Positive = Field(
-        description="maximum deviation of hardware that is within tolerance"
+        description="deviation of value from expected that hardware within its tolerances can have"
     )
     suspected: bool = Field(description="true: the deviation exceeds the threshold persistently")
 

@@ -104,7 +104,9 @@ def test_images_that_do_not_show_enough_switches_are_refused(
 def test_images_without_contrast_are_refused() -> None:
     switches = [(0.3 * number, number % 2 == 0) for number in range(30)]
     exposures = [(at_s, at_s + 0.004, 20.0 + at_s % 2.0) for at_s in np.arange(0.0, 9.0, 0.016)]
-    with pytest.raises(DisplayLatencyError, match=r"no switch is visible .* differ by 1\.0"):
+    with pytest.raises(
+        DisplayLatencyError, match=r"no switch between black and white .* differ by 1\.0"
+    ):
         classify_images(switches, exposures)
 
 

@@ -130,8 +130,8 @@ def classify_images(
     black, white = np.quantile([one[2] for one in seen] or [0.0], (0.25, 0.75))
     if white - black < MIN_CONTRAST:
         raise DisplayLatencyError(
-            f"no switch is visible in {len(seen)} images: the grey levels of white and black "
-            f"differ by {white - black:.1f}, but at least {MIN_CONTRAST:g} are required"
+            f"no switch between black and white is visible in {len(seen)} images: their grey "
+            f"levels differ by {white - black:.1f}, but at least {MIN_CONTRAST:g} are required"
         )
     images = []
     for start_s, end_s, level in seen:

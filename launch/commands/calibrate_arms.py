@@ -79,7 +79,7 @@ def arms(
         ),
     ] = None,
     twin: Annotated[
-        bool, typer.Option("--twin", help="Calibrate simulated arms instead of recorded poses.")
+        bool, typer.Option("--twin", help="Calibrate simulated arms; do not read recorded poses.")
     ] = False,
     places: Annotated[int, typer.Option(help="Number of simulated poses per arm.", min=6)] = 16,
     apparatus: options.TwinApparatusOption = None,

@@ -152,9 +152,9 @@ def _make_press(
     motion: Floats,
     holds: tuple[RestInterval, ...],
 ) -> Press:
-    """Make a press in which the finger moves along the normal of the surface.
+    """Return the path of a finger that moves along the surface normal at one point.
 
-    motion: n times (s) and heights (m) above the surface, (n, 2).
+    motion: array (n, 2) of times (s) and heights above the surface (m).
     """
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M

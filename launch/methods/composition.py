@@ -460,10 +460,10 @@ def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figu
 
 
 def _outside(combination: Combination) -> float:
-    """Return in how many cases the methods of a combination are not valid.
+    """Return a measure of how far a combination of methods is outside its valid range.
 
-    For each method, this is the fraction of the scene's cases outside the range in which the method
-    is valid. The result is the sum of these fractions.
+    For each method, the fraction of the scene's cases outside the valid range of the method is
+    computed. The result is the sum of these fractions.
     """
     return sum(option.outside for option in combination.values())
 

@@ -54,11 +54,13 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """A builder of soft bodies that stores the last precomputed model in memory.
+    """A builder of the soft body of a scene, from models and tables in the cache.
 
-    workers: number of processes that compute a table; 0 means one per core. scheduler: address of a
-    dask scheduler whose workers compute the table instead. If the cache in `cache_dir` is empty,
-    calls of the methods take seconds to minutes.
+    The linear model is computed if the cache in `cache_dir` does not contain it, which takes
+    seconds to minutes. The last model is also stored in memory.
+
+    workers: number of processes that compute a nonlinear table; 0 means one per core. scheduler:
+    address of a dask scheduler whose workers compute the table instead.
     """
 
     skin_spacing_m: float

@@ -97,10 +97,11 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """List the finger radii and sheet widths whose stored shapes are interpolated for a scene.
+    """Return the scenes whose stored deflection shapes are interpolated for a given scene.
 
-    Returns pairs of a weight and a copy of the scene with a stored radius and width. The sum of the
-    deflection shapes, multiplied by the weights, approximates the shapes of the scene.
+    The result is pairs of a weight and a scene. Each scene is a copy of the given one with another
+    finger radius and sheet width. The weighted sum of the stored deflection shapes approximates the
+    shapes of the given scene.
     """
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})

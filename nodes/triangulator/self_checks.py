@@ -70,7 +70,7 @@ class CameraCheck:
         self._resting: deque[tuple[int, Floats]] = deque()
 
     def on_frame(self, frame: Frame) -> None:
-        """Store the expected positions of the check marks from the message of a displayed frame."""
+        """Store where the currently projected frame contains check marks (small bright dots)."""
         self._projection.on_frame(frame)
 
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:

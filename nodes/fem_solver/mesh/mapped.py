@@ -136,9 +136,11 @@ def _map_lattices(
     and its vertices are mapped to the solid. A mesh consists of corners (n, 3), tetrahedra (e, 4),
     and flags (n,) for corners on the boundary.
 
-    below_m, above_m (3,): extents of the negative and of the positive sides.
+    below_m, above_m (3,): extents of the lattice in the negative and positive directions of the
+        axes.
     element_m: minimum element size.
-    positions: function that maps vertices, and returns the required element sizes there.
+    positions: function that maps vertices to the solid. It also returns the required element size
+        at each mapped vertex.
     """
     found: list[tuple[Floats, Ints, Bools]] = []
     for cells in COARSENINGS:
