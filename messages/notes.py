@@ -229,6 +229,12 @@ class NodeNote(Enum):
         + BUSY_FIRST
         + "Then check the cable and the network of the arm.",
     )
+    FINGER_PATH_REFUSED = (
+        "refused finger path",
+        "The simulated finger cannot follow a path of the topic `twin/finger_path`, and continues "
+        "its present motion.",
+        "Correct the path as the note states, and publish it again: `flexsheet topic pub`.",
+    )
     FORCE_ERROR = (
         "force error up to",
         "The note states the relative force error that the method of the soft body is known to "

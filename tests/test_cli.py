@@ -279,6 +279,19 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
     assert one["header"]["writer"] == "beacon"
 
 
+def path_text(times_s: list[float]) -> str:
+    """Return the text of a finger path with two points and the given times."""
+    return json.dumps(
+        {
+            "label": "there",
+            "times_s": times_s,
+            "positions_world_m": [[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]],
+            "wander_m": 0.0,
+            "tremor_m": 0.0,
+        }
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "word"),
     [
@@ -289,6 +302,8 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
         (("hz", "display", "--duration", "0.2"), 1, 'no message on "display"'),
         (("pub", "estop", "{engaged: maybe}"), 2, "MESSAGE (EStop): engaged"),
         (("pub", "estop", "{engaged: ["), 2, "not valid YAML or JSON"),
+        (("pub", "twin/finger_path", path_text([0, 0])), 2, "does not come after times_s[0] = 0"),
+        (("pub", "twin/finger_path", path_text([0])), 2, "1 times for 2 points"),
         (("pub", "estop", "@nowhere.yaml"), 2, "cannot be read"),
         (("echo", "estop", "--run", "/nowhere"), 2, "does not contain plan.json"),
     ],
@@ -621,6 +636,7 @@ def test_pub_reaches_the_graph(flexsheet: Command, running: Path) -> None:
     )
     assert printed.code == 0
     assert 'sent 2 on "display"' in printed.err
+    assert "if a node refuses the message, `flexsheet status` shows why" in printed.err
     live = flexsheet("bag", "info", running, "--json")
     assert live.code == 0
 
