@@ -387,7 +387,7 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
     assert np.array_equal(node.truth(10**9).position, before)
     slow = fast.model_copy(update={"label": "slow", "times_s": np.array([0.0, 1.0])})
     await node.step("twin__finger_path", slow, header())
-    assert node.note == 'path "slow"'
+    assert node.note == 'follows the path "slow"'
 
 
 class SkippingClock(SystemClock):
@@ -413,7 +413,7 @@ async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(scene: Sc
         busy = "frames missed because the computer was busy"
         await until(lambda: node.note == f"{node.missed_frames} {busy}")
         node.path_label = "stroke"
-        await until(lambda: node.note == f'path "stroke", {node.missed_frames} {busy}')
+        await until(lambda: node.note == f'follows the path "stroke", {node.missed_frames} {busy}')
     finally:
         await node.close()
     period_ns = round(1e9 / scene.camera.rate_hz)

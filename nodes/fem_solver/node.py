@@ -31,7 +31,7 @@ from flexsheet.nodes.node import Input, Node, Output
 T = TypeVar("T")
 
 POLL_S = 0.05
-TABLE_NOTE = "; the nonlinear table is being computed"
+TABLE_NOTE = f"; {NodeNote.COMPUTING_TABLE.phrase}"
 BLEND_S = 5.0
 """The duration of the gradual transition between the responses of two methods, in seconds."""
 
@@ -71,7 +71,7 @@ class FemSolver(Node):
         self._fallback: DeadlineFallback
         self._set_bodies([])
         self._reset_contact()
-        self.note = "waiting for a scene"
+        self.note = NodeNote.WAITING_FOR_SCENE.phrase
 
     def _reset_contact(self) -> None:
         self._last: Response | None = None
@@ -121,7 +121,7 @@ class FemSolver(Node):
         self._reset_contact()
         await self._stop_table_task()
         if scene.object.material is None:
-            self.note = "no soft body: the object is rigid"
+            self.note = NodeNote.RIGID_OBJECT.phrase
             return
         p, factory = self.parameters, self._factory
         method, factory.skin_spacing_m = choose_method(
@@ -134,10 +134,10 @@ class FemSolver(Node):
                 partial(self.is_superseded, "scene"),
             )
         except precompute.Interrupted:
-            self.note = "precomputation interrupted"
+            self.note = NodeNote.COMPUTATION_INTERRUPTED.phrase
             return
         except Exception as error:
-            self.note = f"no soft body: {error}"
+            self.note = f"{NodeNote.SOFT_BODY_FAILED.phrase} {error}"
             raise
         self._set_bodies(bodies)
         self.note += factory.pending_note(scene, method, bodies)
@@ -171,7 +171,7 @@ class FemSolver(Node):
                 on_quick,
             )
         except precompute.Interrupted:
-            self.note = "the nonlinear table was interrupted; the next start continues it"
+            self.note = f"{NodeNote.TABLE_INTERRUPTED.phrase}; the next start continues it"
         except Exception as error:
             self.report_error("nonlinear_table", error)
         else:
@@ -182,7 +182,7 @@ class FemSolver(Node):
             raise precompute.Interrupted
         eta = self._eta.text(done, total, self.clock.now_ns() * 1e-9)
         now = "".join(f"; now {self._describe(one)}" for one in [*self._bodies.values()][:1])
-        self.note = f"precomputing the soft body: {eta} ({need}){now}"
+        self.note = f"{NodeNote.COMPUTING_SOFT_BODY.phrase} {eta} ({need}){now}"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:

@@ -356,12 +356,16 @@ class TwinFingerNode(Node):
         self._update_note()
 
     def _update_note(self) -> None:
-        parts = [f'path "{self.path_label}"'] if self.path_label else []
+        parts = []
+        if self.path_label:
+            parts.append(f'{NodeNote.FOLLOWS_PATH.phrase} "{self.path_label}"')
         if self.missed_frames:
-            missed = f"{self.missed_frames} {NodeNote.FRAMES_MISSED.phrase}"
-            parts.append(f"{missed} because the computer was busy")
+            parts.append(
+                f"{self.missed_frames} {NodeNote.FRAMES_MISSED.phrase} because the computer was "
+                "busy"
+            )
         if self.parameters.hand == "coupled" and self.coupled is None:
-            parts.append("the force of the sheet on the finger is being computed")
+            parts.append(NodeNote.COMPUTING_SHEET_REACTION.phrase)
         if self.refusal:
             parts.append(self.refusal)
         self.note = ", ".join(parts)
