@@ -329,9 +329,9 @@ class NodeNote(Enum):
     COMPUTING_SOFT_BODY = (
         "precomputing the soft body:",
         "The model of the soft object is computed once and then cached. The note states the "
-        "remaining time, and after `now` the model that is used until then.",
-        "Wait, or continue if the note names a model after `now`. `flexsheet precompute SCENE` "
-        "does the same before a start.",
+        "progress, and the model with which the graph works until then.",
+        "Continue if the graph works with another model until then; otherwise wait. `flexsheet "
+        "precompute SCENE` does the same before a start.",
     )
     COMPUTING_TABLE = (
         "the nonlinear table is being computed",

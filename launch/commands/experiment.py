@@ -601,8 +601,9 @@ def stability(
     from flexsheet.launch.experiments.hand_gestures import hand_gestures_result, run_gestures
     from flexsheet.launch.experiments.pictures import draw_stability
     from flexsheet.launch.experiments.run import require_scene
-    from flexsheet.launch.health.compliance import compute_front_curve
+    from flexsheet.launch.health.compliance import ForceCurveStage, compute_front_curve
     from flexsheet.launch.plans.plan import load_graph
+    from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
     if (graph or apparatus is not None) and not (gestures and graph):
@@ -613,8 +614,10 @@ def stability(
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
-        progress("computing the object's force curve")
-        curve = compute_front_curve(loaded)
+        reporters = {stage: report_time_left(stage, progress) for stage in ForceCurveStage}
+        curve = compute_front_curve(
+            loaded, on_progress=lambda stage, done, total: reporters[stage](done, total)
+        )
         if gestures:
             touched, forces = (
                 run_gestures(launch_file, given, folder, curve, progress, apparatus=apparatus)

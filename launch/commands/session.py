@@ -179,13 +179,16 @@ def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
     superseded, overflowed, lost = list[str](), list[str](), list[str]()
     for row in rows:
+        newest, every, missing = dict[str, int](), dict[str, int](), dict[str, int]()
         for port in row["inputs"]:
-            name = f"{row['node']} {{}} of {port['topic']}"
+            is_every = find_topic(port["topic"]).delivery is Delivery.EVERY
             if row["skipped"] and port["dropped"]:
-                is_every = find_topic(port["topic"]).delivery is Delivery.EVERY
-                (overflowed if is_every else superseded).append(name.format(port["dropped"]))
+                (every if is_every else newest)[port["topic"]] = port["dropped"]
             if row["lost"] and (count := port["gaps"] + port["rejected"]):
-                lost.append(name.format(count))
+                missing[port["topic"]] = count
+        for texts, counts in ((superseded, newest), (overflowed, every), (lost, missing)):
+            if counts:
+                texts.append(f"{row['node']} {_describe_counts(counts)}")
     lines = []
     if superseded:
         lines.append(
@@ -205,6 +208,14 @@ def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             f"This must not happen: `flexsheet logs {lossy}` shows the reason."
         )
     return lines
+
+
+def _describe_counts(counts: Mapping[str, int]) -> str:
+    """Return a text with the largest count, its topic, and the sum of the other counts."""
+    most = max(counts, key=lambda topic: counts[topic])
+    others = sum(counts.values()) - counts[most]
+    more = f" and {others} of other topics" if others else ""
+    return f"{counts[most]} of {most}{more}"
 
 
 def describe_output(port: dict[str, Any]) -> str:

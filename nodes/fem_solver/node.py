@@ -153,6 +153,10 @@ class FemSolver(Node):
         """
         loop = asyncio.get_running_loop()
         stop = self._stop
+        self.log.info(
+            "computes the nonlinear table of the soft body in the background, which takes minutes; "
+            "the graph works meanwhile, and `flexsheet status` shows the progress"
+        )
 
         async def adopt(quick: body.SceneBody) -> None:
             if not stop.is_set():
@@ -181,8 +185,9 @@ class FemSolver(Node):
         if stop.is_set() or self._stop.is_set():
             raise precompute.Interrupted
         eta = self._eta.text(done, total, self.clock.now_ns() * 1e-9)
-        now = "".join(f"; now {self._describe(one)}" for one in [*self._bodies.values()][:1])
-        self.note = f"{NodeNote.COMPUTING_SOFT_BODY.phrase} {eta} ({need}){now}"
+        now = [self._describe(one) for one in self._bodies.values()]
+        until_then = f"; the graph works until then with {now[0]}" if now else ""
+        self.note = f"{NodeNote.COMPUTING_SOFT_BODY.phrase} {eta} ({need}){until_then}"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:
