@@ -1,4 +1,4 @@
-"""Define the problems that nodes report, with the remedies that `flexsheet explain` prints."""
+"""Define the notes of nodes, with the meanings and remedies that `flexsheet explain` prints."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ if TYPE_CHECKING:  # the import takes longer than `flexsheet explain` may take
     from flexsheet.messages.types import FingertipReason, SelfCheck, SheetReason, SuspectedCause
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
+NO_ACTION = "No action is needed."
 
 
 class NodeNote(Enum):
-    """The problems that nodes report and that require an action of the user.
+    """The problems and states that nodes report in their notes.
 
     phrase: constant part of the reported text.
     meaning: sentence that describes the problem.
@@ -144,6 +145,11 @@ class NodeNote(Enum):
         "The program of the arm's controller stopped because no command arrived.",
         BUSY_FIRST + "Then read the log of the arm's bridge, and run `flexsheet arms reset`.",
     )
+    SERVO_FAULT = (
+        "servo fault",
+        "The arm's controller has stopped the arm because of a fault of a servo.",
+        "Read the fault at the controller and remove it. Then run `flexsheet arms reset`.",
+    )
     STATUS_STALE = (
         "its joint angles are not used",
         "The arm's controller answers with old joint angles.",
@@ -228,6 +234,310 @@ class NodeNote(Enum):
         "No action is needed unless the number grows steadily. "
         + BUSY_FIRST
         + "Then check the cable and the network of the arm.",
+    )
+    WAITING_FOR_SCENE = (
+        "waits for the scene",
+        "The node needs the scene, which the launcher publishes after the start.",
+        "Wait a few seconds. If the note remains, read the log of the launcher: `flexsheet logs`.",
+    )
+    WAITING_FOR_TARGET = (
+        "waiting for a sheet target",
+        "The planner has not sent a sheet target since the bridge started.",
+        "Wait until the finger is measured. If the note remains: `flexsheet topic hz fingertip`.",
+    )
+    ESTOP_ENGAGED = (
+        "e-stop:",
+        "An e-stop stops the arms. The text after it is the reason.",
+        "Remove the reason. Then run `flexsheet arms reset`.",
+    )
+    SHEET_LENGTH = (
+        "the measured length of the sheet is not possible",
+        "The measured poses of the arms are farther apart than the sheet can be long.",
+        "Check that the sheet is clamped, and calibrate the bases of the arms "
+        "(docs/set-up-arms.md).",
+    )
+    JOINT_JUMP = (
+        "the joint angles would jump by",
+        "The next pose of the sheet needs other joint angles, so that the arm would jump.",
+        "Move the arm by hand into the pose for the start. Then run `flexsheet arms reset`.",
+    )
+    LATE_FINGERTIPS = (
+        "late fingertips dropped:",
+        "The planner has ignored measured fingertips that were older than an earlier one.",
+        "No action is needed unless the number grows steadily. " + BUSY_FIRST,
+    )
+    OSCILLATIONS_STOPPED = (
+        "oscillations of finger and sheet stopped:",
+        "Finger and sheet have oscillated against each other, and the planner has stopped this. "
+        "The note counts these events since the start.",
+        "No action is needed after a single one. If the number grows, reduce the delay or use a "
+        "stiffer object (docs/hand-in-the-loop.md).",
+    )
+    FORCE_MODEL = (
+        "sheet force model:",
+        "The note names the model with which the planner computes the sheet's force.",
+        NO_ACTION,
+    )
+    FORCE_TABLE_MISSING = (
+        "the table of the sheet's force is missing",
+        "A simpler, less accurate model of the sheet's force replaces the missing table.",
+        "Run the command `flexsheet precompute` that the note states, and start the graph again.",
+    )
+    FORCE_MODEL_INVALID = (
+        "is not valid here:",
+        "The push is outside the range for which the model of the sheet's force was made.",
+        "Reduce `working_range.push_depth_m` of the scene, or choose another "
+        "`methods.sheet_force`.",
+    )
+    FORCE_NOT_RENDERED = (
+        "than the sheet can render:",
+        "The sheet cannot push as hard or as softly as the virtual object.",
+        "Use another sheet or another object; `flexsheet doctor compliance SCENE` shows the "
+        "errors.",
+    )
+    SOFTER_THAN_SHEET = (
+        "is softer than the sheet",
+        "The least stretched sheet is stiffer than the virtual object.",
+        "Use a softer or wider sheet, or a stiffer object.",
+    )
+    STIFFER_THAN_SHEET = (
+        "is stiffer than the sheet",
+        "The most stretched sheet is softer than the virtual object.",
+        "Use a stiffer sheet, or a softer object.",
+    )
+    TOO_SOFT_FOR_POSITION = (
+        "is too soft for the position tolerance:",
+        "An error of the sheet's position changes the force so much that a user notices it.",
+        "Use a stiffer object, or reduce the error and `tolerances.sheet_position_m` of the scene.",
+    )
+    HAND_CAN_OSCILLATE = (
+        "a hand of low damping can oscillate",
+        "The sheet follows the finger so late that hand and sheet can oscillate.",
+        "Reduce the delay or use a stiffer object (docs/hand-in-the-loop.md).",
+    )
+    RIGID_OBJECT = (
+        "no soft body: the object is rigid",
+        "The object of the scene has no material, so it does not deform.",
+        NO_ACTION,
+    )
+    SOFT_BODY_FAILED = (
+        "no soft body:",
+        "The model of the soft object could not be computed.",
+        "Correct what the note states, in the scene or on this computer. Then start the graph "
+        "again.",
+    )
+    COMPUTING_SOFT_BODY = (
+        "precomputing the soft body:",
+        "The model of the soft object is computed once and then cached. The note states the "
+        "progress, and the model with which the graph works until then.",
+        "Continue if the graph works with another model until then; otherwise wait. `flexsheet "
+        "precompute SCENE` does the same before a start.",
+    )
+    COMPUTING_TABLE = (
+        "the nonlinear table is being computed",
+        "The most accurate model of the soft object is computed in the background.",
+        "Continue: a less accurate model computes the object until then.",
+    )
+    COMPUTATION_INTERRUPTED = (
+        "precomputation interrupted",
+        "A new scene has ended the computation of the soft object's model.",
+        NO_ACTION,
+    )
+    TABLE_INTERRUPTED = (
+        "the nonlinear table was interrupted",
+        "The computation has ended early. Its finished parts are cached.",
+        "Start the graph again, or run `flexsheet precompute SCENE`.",
+    )
+    TABLE_NOT_COMPUTED = (
+        "the scene's nonlinear table is not computed yet",
+        "A less accurate model computes the object, because the cache lacks the table.",
+        "Run the command `flexsheet precompute` that the note states, and start the graph again.",
+    )
+    FRAMES_LOST = (
+        "frames lost",
+        "The note states how many images the camera has lost since its start.",
+        "No action is needed unless the number grows steadily. " + BUSY_FIRST,
+    )
+    PAIRS_REJECTED = (
+        "pairs rejected:",
+        "The exposures of both cameras are farther apart in time than `max_skew_s` allows.",
+        "Synchronise both cameras with a trigger, or increase `max_skew_s` (docs/camera.md).",
+    )
+    UNPAIRED_FRAMES = (
+        "frames without a partner",
+        "One of the two cameras has delivered images to which the other has none.",
+        "No action is needed unless the number grows steadily. Then check cables and trigger.",
+    )
+    NO_IMAGES = (
+        "no images:",
+        "The camera node cannot read its source, and tries again.",
+        "Correct what the note states: cable, device or file of the node's parameter `source`.",
+    )
+    SOURCE_ENDED = (
+        "pairs read, and the source has ended",
+        "The video or the image files of the camera node have ended.",
+        "Start the graph again, or set `loop` of the parameter `source`.",
+    )
+    STAMPED_BY_DRIVER = (
+        "stamped by the driver",
+        "The camera's driver states the time of each image.",
+        NO_ACTION,
+    )
+    STAMPED_ON_ARRIVAL = (
+        "stamped on arrival",
+        "The driver states no plausible times, so that images have the time of their arrival.",
+        "Measure the delay (docs/camera.md), because the latency of the camera is not known.",
+    )
+    MEASURED_RATE = (
+        "Hz measured",
+        "The note states the rate at which the camera delivers images.",
+        "Compare the rate with `camera.rate_hz` of the scene.",
+    )
+    FILE_TIMES = (
+        "frame times of the",
+        "The times of the images are those of the file.",
+        NO_ACTION,
+    )
+    SET_RATE = (
+        "at the set rate",
+        "The images of the file are played at the rate of the parameter `source`.",
+        NO_ACTION,
+    )
+    CROPPED = (
+        "regions cropped from",
+        "The camera node cuts the regions of its parameter `region` out of the images.",
+        NO_ACTION,
+    )
+    IMAGE_RESULTS = (
+        "image pairs dropped as late:",
+        "The note counts the results of the marker detection: `ok` and reasons for no marker.",
+        "`flexsheet explain REASON` explains each reason. Late pairs: " + BUSY_FIRST,
+    )
+    OSC_COUNTS = (
+        "of other addresses",
+        "The note counts the accepted and rejected messages of the tracking program.",
+        "If nothing is accepted, compare the addresses with the parameters of the node.",
+    )
+    UDP_PORT_USED = (
+        "cannot listen on",
+        "The node cannot open the port at which it receives the tracking program's messages.",
+        "End the program that uses the port, or change the parameter `port` of the node.",
+    )
+    EYES_TRACKED = (
+        "the eyes are tracked",
+        "The node measures the position of the user's eyes.",
+        NO_ACTION,
+    )
+    EYES_NOT_TRACKED = (
+        "the eyes are not tracked",
+        "The position of the user's eyes is not measured.",
+        "Check the head camera, its light, and that the face is in its image.",
+    )
+    EYES_OF_SCENE = (
+        "the eyes of the scene are used",
+        "The image is drawn for the eyes of the scene file instead of the measured eyes.",
+        "Check the node that measures the eyes: `flexsheet topic echo eye`.",
+    )
+    NO_GAUGE = (
+        "no gauge:",
+        "The force gauge cannot be read.",
+        "Correct what the note states: cable or parameters of the node. It tries again by itself.",
+    )
+    GAUGE_LINES = (
+        "lines without a number",
+        "The force gauge has sent lines that are no measured force.",
+        "Compare the format of the gauge with the parameters of the node (docs/force.md).",
+    )
+    CLOCK_OFFSETS = (
+        "clock offset of",
+        "The note states by how much the clocks of other hosts differ, and the uncertainty.",
+        NO_ACTION,
+    )
+    CONSOLE_PAGE = (
+        "viewers:",
+        "The note states the address of the console's page, and how many browsers show it.",
+        "Open the address in a browser.",
+    )
+    RECORDER_WAITS = (
+        "waits for a request to record",
+        "The recorder records when the console requests it.",
+        "Press the button of the console to record.",
+    )
+    RECORDING = (
+        "recording:",
+        "The note states how many messages are in the bag, and its file.",
+        NO_ACTION,
+    )
+    RECORDED = (
+        "recorded:",
+        "The note states how many messages are in the finished bag, and its file.",
+        NO_ACTION,
+    )
+    NO_PROJECTOR = (
+        "no image: the scene has no projector",
+        "The scene has no key `projector`, so that no image is drawn.",
+        "Add `projector` to the scene if an image is wanted.",
+    )
+    WINDOW_CLOSED = (
+        "the window was closed",
+        "The user has closed the window of the projector's image.",
+        "Restart the graph or the node to show the image again.",
+    )
+    WINDOW_LOST = (
+        "the window was lost",
+        "The display has closed the window of the projector's image, which opens again.",
+        "Check the cable of the projector and the settings of the desktop.",
+    )
+    WINDOW_SIZE = (
+        "images are shown unscaled in the centre",
+        "The window and the images of the projector have different sizes in pixels.",
+        "Set the same size on the monitor and in `projector` of the scene.",
+    )
+    NO_DEFLECTION_SHAPES = (
+        "the cache contains no deflection shapes",
+        "The shape of the pushed sheet is drawn roughly, because a table is missing.",
+        "Run the command `flexsheet precompute` that the note states, and restart the graph.",
+    )
+    SHEET_FOLDED = (
+        "of the sheet is folded and gets no light",
+        "The pushed sheet hides a part of itself from the projector.",
+        "Push less deeply, or tilt the projector less relative to the sheet.",
+    )
+    DEEP_FOR_TRIANGLES = (
+        "exceeds the maximum for four triangles",
+        "The method that draws the sheet as four triangles is inaccurate for this push.",
+        "Set `methods.sheet_shape` of the scene to `reduced_order`.",
+    )
+    ARM_COMMANDS = (
+        "commands, refused:",
+        "The note counts the commands that each simulated arm has received and refused.",
+        "No action is needed unless the refused commands grow. Then read the bridge's note.",
+    )
+    FRAME_RENDERED = (
+        "rendered the frame",
+        "The note names the last image that was computed for an eye of the user.",
+        NO_ACTION,
+    )
+    FRAME_NOT_RENDERED = (
+        "cannot be rendered",
+        "The view of the eye cannot be computed for images that contain two views.",
+        "Set `stereo` of the topic `display` to `mono`.",
+    )
+    FOLLOWS_PATH = (
+        "follows the path",
+        "The simulated finger moves along the path that the note names, or has ended it.",
+        NO_ACTION,
+    )
+    COMPUTING_SHEET_REACTION = (
+        "the force of the sheet on the finger is being computed",
+        "The table of the sheet's force on the simulated finger is computed once.",
+        "Wait: the finger follows paths when the computation has finished.",
+    )
+    FINGER_PATH_REFUSED = (
+        "refused finger path",
+        "The simulated finger cannot follow a path of the topic `twin/finger_path`, and continues "
+        "its present motion.",
+        "Correct the path as the note states, and publish it again: `flexsheet topic pub`.",
     )
     FORCE_ERROR = (
         "force error up to",

@@ -400,7 +400,7 @@ def test_faults_of_the_arm_are_latched_but_its_watchdog_starts_again() -> None:
     arms[0].cycle(on_time(HOME), arms[1].as_other())
     assert arms[0].command.mode == "idle"
     arms[0].control.on_measurement(arms[0].joints, (ArmFault.SERVO,))
-    assert list(arms[0].control.faults) == ["arm: servo"]
+    assert list(arms[0].control.faults) == ["arm: servo fault"]
 
 
 poses = st.tuples(*[st.floats(-0.15, 0.15)] * 3, *[st.floats(-0.8, 0.8)] * 3)
@@ -474,7 +474,7 @@ async def test_without_a_scene_the_node_waits() -> None:
     )
     await node.setup()
     await node.cycle()
-    assert node.note == "waiting for a scene"
+    assert node.note == "waits for the scene"
     assert not any(isinstance(message, ArmState) for message in sent)
     await node.close()
 

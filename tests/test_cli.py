@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Display, EStop, PortStatus, Status
 from flexsheet.nodes import NODES, NodeImportError
 from tests.commands import Command
+from tests.example_bag import write_example
 from tests.test_doctor_hosts import make_status
 from tests.waiting import DEADLINE_S, wait_until
 
@@ -279,6 +281,19 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
     assert one["header"]["writer"] == "beacon"
 
 
+def path_text(times_s: list[float]) -> str:
+    """Return the text of a finger path with two points and the given times."""
+    return json.dumps(
+        {
+            "label": "there",
+            "times_s": times_s,
+            "positions_world_m": [[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]],
+            "wander_m": 0.0,
+            "tremor_m": 0.0,
+        }
+    )
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "word"),
     [
@@ -289,6 +304,8 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
         (("hz", "display", "--duration", "0.2"), 1, 'no message on "display"'),
         (("pub", "estop", "{engaged: maybe}"), 2, "MESSAGE (EStop): engaged"),
         (("pub", "estop", "{engaged: ["), 2, "not valid YAML or JSON"),
+        (("pub", "twin/finger_path", path_text([0, 0])), 2, "does not come after times_s[0] = 0"),
+        (("pub", "twin/finger_path", path_text([0])), 2, "1 times for 2 points"),
         (("pub", "estop", "@nowhere.yaml"), 2, "cannot be read"),
         (("echo", "estop", "--run", "/nowhere"), 2, "does not contain plan.json"),
     ],
@@ -448,12 +465,21 @@ def test_status_distinguishes_skipped_from_lost_messages() -> None:
     row = describe_node(node, make_status("renderer", inputs=(port,)))
     assert (row["skipped"], row["lost"]) == (4, 3)
     skipped, lost = explain_counts([row])
-    assert skipped.startswith("skipped: ")
+    assert skipped.startswith("skipped: renderer 4 of frame. ")
     assert "This is normal" in skipped
-    assert lost.startswith("lost: ")
+    assert lost.startswith("lost: renderer 3 of frame. ")
     assert "`flexsheet logs renderer`" in lost
     assert explain_counts([{**row, "lost": 0}]) == [skipped]
     assert explain_counts([{**row, "skipped": 0, "lost": 0}, {**row, "lost": None}]) == [skipped]
+
+
+def test_status_reports_the_overflow_of_a_queue_as_a_problem() -> None:
+    port = PortStatus(
+        topic="arm_latency", rate_hz=1.0, age_s=None, messages=9, dropped=2, gaps=0, rejected=0
+    )
+    node = load_graph(DEMO_FILE).nodes["renderer"]
+    (text,) = explain_counts([describe_node(node, make_status("renderer", inputs=(port,)))])
+    assert text.startswith("skipped: renderer 2 of arm_latency. The node needed these messages")
 
 
 def test_status_shows_no_rate_that_has_no_meaning() -> None:
@@ -494,6 +520,10 @@ def test_logs_print_the_log_of_a_node(flexsheet: Command, running: Path) -> None
     lines = flexsheet("logs", "recorder", "--json").out.splitlines()
     assert any(json.loads(line)["event"] == "recording" for line in lines)
     assert len(flexsheet("logs", "recorder", "-n", "1").out.splitlines()) == 1
+    (line,) = flexsheet("logs", "recorder", "-n", "1", "--json").out.splitlines()
+    written = datetime.fromisoformat(json.loads(line)["timestamp"]).astimezone()
+    (shown,) = flexsheet("logs", "recorder", "-n", "1").out.splitlines()
+    assert f"{written:%H:%M:%S}." in shown.partition(json.loads(line)["event"])[0]
     printed = flexsheet("logs", "recorder", "-n", "0")
     assert (printed.code, printed.out, printed.err) == (0, "", "")
     run = runs.list_live_runs()[0]
@@ -583,6 +613,11 @@ def test_fields_of_a_bag_are_plotted(flexsheet: Command, recorded: Path, tmp_pat
     assert np.all(np.diff(time_s["times_s"]) > 0)
     assert "<svg" in image.read_text()
     assert "fingertip" in flexsheet("bag", "plot", recorded, "fingertip.position_m").err
+    printed = flexsheet("bag", "plot", recorded, "twin/finger")
+    assert printed.code == 2
+    assert "twin/finger: name a field of this topic; choose from: twin/finger.path" in printed.err
+    assert "twin/finger.position_world_m" in printed.err
+    assert "path_label" not in printed.err, "a text cannot be plotted"
     printed = flexsheet("bag", "plot", recorded, "twin/finger.position_wrld_m")
     assert (printed.code, 'did you mean "position_world_m"?' in printed.err) == (2, True)
 
@@ -621,6 +656,7 @@ def test_pub_reaches_the_graph(flexsheet: Command, running: Path) -> None:
     )
     assert printed.code == 0
     assert 'sent 2 on "display"' in printed.err
+    assert "if a node refuses the message, `flexsheet status` shows why" in printed.err
     live = flexsheet("bag", "info", running, "--json")
     assert live.code == 0
 
@@ -733,6 +769,15 @@ def test_a_bag_plays_into_a_graph(
     assert {header.writer for _, _, header, _ in stops} == {"listener", "launch"}
 
 
+def test_a_bag_is_not_played_beside_the_nodes_that_write_its_topics(
+    flexsheet: Command, recorded: Path, running: Path
+) -> None:
+    printed = flexsheet("bag", "play", recorded)
+    assert printed.code == 1
+    assert "not played: twin/finger: beacon writes it" in printed.err
+    assert f"flexsheet bag play {recorded} --launch replay" in printed.err
+
+
 def test_play_can_bring_its_graph_and_restores_latched_topics_first(
     flexsheet: Command, runs_root: Path, tmp_path: Path
 ) -> None:
@@ -769,6 +814,10 @@ def test_a_missing_graph_is_reported(
     printed = flexsheet("topic", "echo", "twin/finger")
     assert printed.code == 1
     assert "no graph is running" in printed.err
+    bag = write_example(tmp_path / "a.mcap")
+    printed = flexsheet("bag", "play", bag)
+    assert printed.code == 1
+    assert f"start one: flexsheet bag play {bag} --launch replay" in printed.err
     runs.create_run()
     printed = flexsheet("topic", "echo", "twin/finger")
     assert printed.code == 1

@@ -87,7 +87,8 @@ def test_results_before_an_error_are_printed(
         file: Path, given: object, bag: Path, progress: Any, report: demo.Report, **_: object
     ) -> NoReturn:
         bag.touch()
-        report(demo.DemoResult(strokes=[STROKE], images=[tmp_path / "stroke.png"]))
+        figure = demo.DemoFigure(tmp_path / "stroke.png", demo.STROKE_FIGURE)
+        report(demo.DemoResult(strokes=[STROKE], figures=[figure]))
         raise OverloadedError("timeout: waited 40 s for the eye's image")
 
     monkeypatch.setattr(demo, "run_demo", fail_at_image)
@@ -101,6 +102,27 @@ def test_results_before_an_error_are_printed(
         assert "0.062" in out
         assert "stroke.png" in err
         assert "flexsheet explain overloaded" in err
+
+
+def test_the_demo_ends_with_the_files_and_what_they_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flexsheet: Command
+) -> None:
+    def run_short(
+        file: Path, given: object, bag: Path, progress: Any, report: demo.Report, **_: object
+    ) -> None:
+        report(demo.DemoResult(figures=[demo.DemoFigure(bag.parent / "latency.png", "delays")]))
+        report(demo.DemoResult(figures=[demo.DemoFigure(bag.parent / "eye.png", "images")]))
+
+    monkeypatch.setattr(demo, "run_demo", run_short)
+    code, _, err = flexsheet("demo", "--output", tmp_path)
+    assert code == 0
+    assert err.splitlines()[-5:] == [
+        f"files to look at, in {tmp_path}:",
+        "  eye.png: images",
+        "  latency.png: delays",
+        "  demo.mcap: recording of all topics",
+        f"all figures and faults of the recording: flexsheet bag report {tmp_path}/demo.mcap",
+    ]
 
 
 def test_an_error_names_the_bag_and_the_command_that_evaluates_it(

@@ -438,7 +438,7 @@ async def test_an_old_fingertip_is_held_and_one_out_of_order_left_out() -> None:
     count = len(desk.sent)
     await desk.see(in_world(on_cylinder(30.0, 0.02)), after_ns=-FRAME_NS)
     assert len(desk.sent) == count
-    assert "1 late fingertips dropped" in desk.planner.note
+    assert "late fingertips dropped: 1" in desk.planner.note
 
 
 @examples(10)

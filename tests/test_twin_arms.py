@@ -375,6 +375,6 @@ async def test_the_node_can_use_the_real_time_control() -> None:
         assert node.errors == 0, node.last_error
         assert {type(server) for server in node.servers.values()} == {MxtServer}
         await node.cycle()
-        assert node.note == "left: 0 commands, 0 refused, right: 0 commands, 0 refused"
+        assert node.note == "left: 0 commands, refused: 0, right: 0 commands, refused: 0"
     finally:
         await node.close()

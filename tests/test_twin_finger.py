@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from flexsheet.launch.commands.explain import find_entries
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import SystemClock, VirtualClock
 from flexsheet.messages.scene import Lens, Scene
@@ -379,9 +380,14 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
         tremor_m=0.0,
     )
     await node.step("twin__finger_path", fast, header())
-    assert node.errors == 1
-    assert "increase the times" in node.last_error
+    assert node.errors == 0
+    assert node.note.startswith('refused finger path "fast": path: the speed')
+    assert node.note.endswith("increase the times")
+    assert [one.code for one in find_entries(node.note)] == ["finger-path-refused"]
     assert np.array_equal(node.truth(10**9).position, before)
+    slow = fast.model_copy(update={"label": "slow", "times_s": np.array([0.0, 1.0])})
+    await node.step("twin__finger_path", slow, header())
+    assert node.note == 'follows the path "slow"'
 
 
 class SkippingClock(SystemClock):
@@ -407,7 +413,7 @@ async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(scene: Sc
         busy = "frames missed because the computer was busy"
         await until(lambda: node.note == f"{node.missed_frames} {busy}")
         node.path_label = "stroke"
-        await until(lambda: node.note == f'path "stroke", {node.missed_frames} {busy}')
+        await until(lambda: node.note == f'follows the path "stroke", {node.missed_frames} {busy}')
     finally:
         await node.close()
     period_ns = round(1e9 / scene.camera.rate_hz)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,9 +60,13 @@ def read_fields(
     paths = {name: _parse(name) for name in names}
     reader = BagReader(bag)
     recorded = sorted(reader.topics)
-    for name, (topic, _) in paths.items():
+    for name, (topic, path) in paths.items():
         if topic not in recorded:
             raise _error(bag, f'{name}: topic "{topic}" is not in the bag', topic, recorded)
+        if not path:
+            what = f"{topic}: name a field of this topic"
+            fields = list_plottable_fields(bag, topic)
+            raise BadInputError.single(str(bag), (), what, f"choose from: {', '.join(fields)}")
     summary = reader.info()
     rows: dict[str, list[tuple[float, Floats]]] = {name: [] for name in names}
     topics = {topic for topic, _ in paths.values()}
@@ -74,8 +78,40 @@ def read_fields(
     return [_make_series(bag, name, found) for name, found in rows.items()]
 
 
+def list_plottable_fields(bag: Path, topic: str) -> list[str]:
+    """Return the fields of a recorded topic that can be plotted, as "TOPIC.FIELD".
+
+    A field can be plotted if it is numeric in the first message of the topic. If this message does
+    not contain an optional field, the field is not listed.
+    """
+    for _, message, _, _ in BagReader(bag, [topic]):
+        return [f"{topic}.{name}" for name in _list_numeric(message)]
+    return []
+
+
+def _list_numeric(message: BaseModel) -> Iterator[str]:
+    for name in type(message).model_fields:
+        value = getattr(message, name)
+        if isinstance(value, BaseModel):
+            yield from (f"{name}.{inner}" for inner in _list_numeric(value))
+        elif isinstance(value, (bool, int, float, tuple, np.ndarray)):
+            numbers = _convert_numbers(value)
+            if numbers is not None and 0 < numbers.size <= MAX_COMPONENTS:
+                yield name
+
+
+def _convert_numbers(value: Any) -> Floats | None:
+    """Return a value as numbers (n,), or None if it is not numeric."""
+    try:
+        return np.asarray(value, dtype=np.float64).reshape(-1)
+    except (TypeError, ValueError):
+        return None
+
+
 def _parse(name: str) -> tuple[str, list[str]]:
     """Split "TOPIC.FIELD.FIELD" into the topic and the list of nested field names.
+
+    The list is empty if the name is a topic only.
 
     Raises BadInputError if the topic or its field does not exist.
     """
@@ -84,6 +120,8 @@ def _parse(name: str) -> tuple[str, list[str]]:
         fields: Any = find_topic(topic).message.model_fields
     except UnknownTopicError as error:
         raise BadInputError.single(name, (), str(error)) from error
+    if not path:
+        return topic, []
     first, *inner = path.split(".")
     if first not in fields:
         what = f'topic "{topic}" does not contain the field "{first}"'
@@ -111,12 +149,11 @@ def _get_number(bag: Path, name: str, message: BaseModel, path: Sequence[str]) -
     if isinstance(value, BaseModel):
         inner = list(type(value).model_fields)
         raise _error(bag, f"{name}: this is a group of fields; append one of them", "", inner)
-    try:
-        numbers = np.asarray(value, dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError) as error:
+    numbers = _convert_numbers(value)
+    if numbers is None:
         raise BadInputError.single(
             str(bag), (), f"{name}: the field is not a number", "choose another field"
-        ) from error
+        )
     if numbers.size > MAX_COMPONENTS:
         what = f"{name}: the field has {numbers.size} numbers, more than {MAX_COMPONENTS}"
         raise BadInputError.single(str(bag), (), what, "choose another field")

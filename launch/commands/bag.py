@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from flexsheet.launch.commands import complete, options
-from flexsheet.launch.commands.graph import run_interruptible, run_node_here, running_graph
+from flexsheet.launch.commands.graph import (
+    NoGraphError,
+    run_interruptible,
+    run_node_here,
+    running_graph,
+)
 from flexsheet.launch.commands.launching import print_omitted
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -179,8 +184,15 @@ def play(
                 await graph.wait_ready()
             return await play_into(plan, graph.run)
 
-    work = play_into(*running_graph(run)) if launch is None else start_and_play(launch)
-    raise typer.Exit(run_interruptible(work))
+    if launch is not None:
+        raise typer.Exit(run_interruptible(start_and_play(launch)))
+    try:
+        running = running_graph(run)
+    except NoGraphError as error:
+        raise NoGraphError(
+            f"{error}; or let this command start one: flexsheet bag play {bag} --launch replay"
+        ) from error
+    raise typer.Exit(run_interruptible(play_into(*running)))
 
 
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
@@ -383,7 +395,7 @@ def plot(
         typer.Argument(
             metavar="TOPIC.FIELD...",
             help="Numeric fields, such as fingertip.position_world_m. Each field has its own "
-            "chart.",
+            "chart. For a topic without a field, the possible fields are listed.",
         ),
     ],
     output: Annotated[
@@ -575,8 +587,8 @@ async def _play(
     rate: playback speed relative to the recording.
     start_s: time in the bag at which playback starts.
     """
+    from flexsheet.launch.bags.player import NEVER_PLAYED, select_topics
     from flexsheet.launch.bags.player import play as play_bag
-    from flexsheet.launch.bags.player import select_topics
     from flexsheet.messages.bag import BagReader
 
     selection = select_topics(BagReader(bag).topics, plan, tuple(topics or ()))
@@ -584,9 +596,15 @@ async def _play(
         words.print(f"not played: {name}: {why}")
     if not selection.topics:
         raise CommandError(
-            f"{bag}: contains no topic that can be played into {plan.launch_file}; "
-            "list the topics to play under external_topics there",
+            f"{bag}: contains no topic that can be played into {plan.launch_file}; play it into a "
+            "graph without the nodes that write these topics: "
+            f"flexsheet bag play {bag} --launch replay",
             FAILED,
+        )
+    if any(plan.writers.get(name) for name in selection.left_out.keys() - NEVER_PLAYED.keys()):
+        words.print(
+            "to play topics that a node writes, use a launch file without this node that lists "
+            "them under external_topics, such as --launch replay"
         )
     sent = 0
     while True:

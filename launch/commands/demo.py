@@ -60,10 +60,10 @@ def demo(
     def report(new: DemoResult) -> None:
         results.strokes += new.strokes
         results.followed = new.followed or results.followed
-        images = [one for one in new.images if one not in results.images]
-        results.images += images
+        figures = [one for one in new.figures if one not in results.figures]
+        results.figures += figures
         if not as_json:
-            _print_result(replace(new, images=images))
+            _print_result(replace(new, figures=figures))
 
     try:
         with progress_words() as progress:
@@ -75,7 +75,7 @@ def demo(
     if as_json:
         _print_results(results, bag)
     else:
-        words.print(f"bag: {bag}")
+        _print_files(results, bag)
 
 
 def _print_result(result: DemoResult) -> None:
@@ -84,8 +84,18 @@ def _print_result(result: DemoResult) -> None:
     if result.followed is not None:
         print_followed([result.followed])
     sys.stdout.flush()
-    for image in result.images:
-        words.print(f"image: {image}")
+    for figure in result.figures:
+        words.print(f"image: {figure.path}")
+
+
+def _print_files(result: DemoResult, bag: Path) -> None:
+    """Print the files that the demo has written, and what each shows."""
+    words.print(f"files to look at, in {bag.parent}:")
+    # The image at the eye shows the purpose of the system, so it comes first.
+    for figure in reversed(result.figures):
+        words.print(f"  {figure.path.name}: {figure.shows}")
+    words.print(f"  {bag.name}: recording of all topics")
+    words.print(f"all figures and faults of the recording: flexsheet bag report {bag}")
 
 
 def _print_results(result: DemoResult, bag: Path) -> None:
@@ -94,6 +104,6 @@ def _print_results(result: DemoResult, bag: Path) -> None:
             "strokes": result.strokes,
             "followed": result.followed,
             "bag": str(bag),
-            "figures": [str(image) for image in result.images],
+            "figures": [str(figure.path) for figure in result.figures],
         }
     )

@@ -20,6 +20,7 @@ from flexsheet.launch.commands.output import (
     progress_words,
     words,
 )
+from flexsheet.launch.percent import format_percent
 
 if TYPE_CHECKING:
     from flexsheet.launch.health.layout import Layout
@@ -132,8 +133,8 @@ def _print_reach(layout: Layout) -> None:
     """
     if not layout.reachable:
         words.print(
-            f"not reachable: the arms reach {100 * layout.reached.mean():.1f} % of the working "
-            "range; searching for remedies, which can take minutes (Ctrl-C ends the search)"
+            f"not reachable: the arms reach {format_percent(layout.reached.mean())} of the "
+            "working range; searching for remedies, which can take minutes (Ctrl-C ends the search)"
         )
 
 
@@ -153,8 +154,10 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
             ("reachable", "yes" if result["reachable"] else "NO"),
             (
                 "reachable samples",
-                f"{100 * result['fraction']:.1f} % of {result['samples']}, "
-                + ", ".join(f"{side} {100 * one['fraction']:.1f} %" for side, one in arms.items()),
+                f"{format_percent(result['fraction'])} of {result['samples']}, "
+                + ", ".join(
+                    f"{side} {format_percent(one['fraction'])}" for side, one in arms.items()
+                ),
             ),
             *(
                 (f"{side} arm's joint solution", _describe_branch(one["branch"]))
@@ -173,7 +176,7 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
         (
             side,
             one["limit"],
-            f"{100 * one['fraction']:.1f} %",
+            format_percent(one["fraction"]),
             f"{math.degrees(one['first_tilt_rad']):.1f}°",
             f"{1e3 * one['first_depth_m']:.0f} mm",
         )
@@ -202,7 +205,7 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
     if result["fraction_at_working_speed"] < 1.0:
         print(
             f"warning: the arms follow {1e3 * required_m_per_s:.0f} mm/s at only "
-            f"{100 * result['fraction_at_working_speed']:.1f} % of the samples"
+            f"{format_percent(result['fraction_at_working_speed'])} of the samples"
         )
     for remedy in result["remedies"]:
         print(f"remedy: {remedy['what']}")

@@ -43,9 +43,15 @@ def compliance(
 
     The command compares the force of the object's model with the rendered force, for pushes at the
     centre up to the maximum depth of the scene. It also checks that hand and sheet cannot oscillate
-    at the given delay. The exit code is 1 if a check fails.
+    at the given delay. The first call computes the object's model, which takes minutes. The exit
+    code is 1 if a check fails.
     """
-    from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
+    from flexsheet.launch.health.compliance import (
+        ForceCurveStage,
+        compliance_result,
+        compute_front_curve,
+        describe_estimate,
+    )
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.messages.sheet_calibration import load_sheet_calibration
@@ -57,19 +63,24 @@ def compliance(
         scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
     )
     with progress_words() as progress:
-        on_progress = report_time_left("computing the object's force curve (only once)", progress)
-        curve = ObjectCurve.from_rows(compute_front_curve(scene, on_progress=on_progress))
+        reporters = {stage: report_time_left(stage, progress) for stage in ForceCurveStage}
+        rows = compute_front_curve(
+            scene,
+            on_progress=lambda stage, done, total: reporters[stage](done, total),
+            on_linear=lambda linear: words.print(describe_estimate(scene, law, linear)),
+        )
+        curve = ObjectCurve.from_rows(rows)
         progress("computing the rendered force")
-        result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms)
+        result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms, progress=progress)
     if as_json:
         print_json(result)
     else:
-        rows = [
+        table = [
             {**row, "error": row["rendered_n"] / max(row["target_n"], 1e-9) - 1}
             for row in result["rows"]
         ]
         print_columns(
-            rows,
+            table,
             {
                 "depth, mm": ("depth_mm", ".0f"),
                 "model, N": ("target_n", ".3f"),

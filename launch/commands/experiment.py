@@ -18,6 +18,7 @@ from flexsheet.launch.commands.output import (
     shown,
     words,
 )
+from flexsheet.launch.percent import format_percent
 from flexsheet.launch.plans.features import Feature
 
 if TYPE_CHECKING:
@@ -473,13 +474,17 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
     rows = []
     for result in results:
         now, *ahead = result["prediction"]
-        row = [result["gesture"], shown(result["valid_ratio"], ".1%"), str(result["missing"])]
+        row = [result["gesture"], _show_ratio(result["valid_ratio"]), str(result["missing"])]
         row += [shown(result["error_mm"][key], ".3f") for key in ("rms", "p99", "max")]
         row += [shown(result["jump"]["max_sigmas"], ".1f"), shown(now["lag_ms"], ".1f")]
         for each in ahead:
             row += [shown(each["rms"], ".3f"), shown(each["lag_ms"], ".1f")]
         rows.append(row)
     print_table(columns, rows)
+
+
+def _show_ratio(ratio: float | None) -> str:
+    return "-" if ratio is None else format_percent(ratio)
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
@@ -494,8 +499,8 @@ def print_followed(results: list[dict[str, Any]]) -> None:
     rows = []
     for result in results:
         ratio, contact = result["following_ratio"], result["contact"]
-        row = [result["path"], f"{result['contact_ratio']:.1%}"]
-        row += [shown(ratio, ".1%"), str(result["drop_outs"])]
+        row = [result["path"], format_percent(result["contact_ratio"])]
+        row += [_show_ratio(ratio), str(result["drop_outs"])]
         for key in ("true_delta_d_mm", "true_delta_theta_deg"):
             errors = contact[key] or dict.fromkeys(("mean", "p95", "max"))
             row += [shown(errors[name], ".3f") for name in ("mean", "p95", "max")]
@@ -596,8 +601,9 @@ def stability(
     from flexsheet.launch.experiments.hand_gestures import hand_gestures_result, run_gestures
     from flexsheet.launch.experiments.pictures import draw_stability
     from flexsheet.launch.experiments.run import require_scene
-    from flexsheet.launch.health.compliance import compute_front_curve
+    from flexsheet.launch.health.compliance import ForceCurveStage, compute_front_curve
     from flexsheet.launch.plans.plan import load_graph
+    from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
     if (graph or apparatus is not None) and not (gestures and graph):
@@ -608,8 +614,10 @@ def stability(
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
-        progress("computing the object's force curve")
-        curve = compute_front_curve(loaded)
+        reporters = {stage: report_time_left(stage, progress) for stage in ForceCurveStage}
+        curve = compute_front_curve(
+            loaded, on_progress=lambda stage, done, total: reporters[stage](done, total)
+        )
         if gestures:
             touched, forces = (
                 run_gestures(launch_file, given, folder, curve, progress, apparatus=apparatus)

@@ -6,6 +6,7 @@ import asyncio
 import json
 import signal
 from collections.abc import Callable, Collection, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -289,6 +290,20 @@ def format_log_line(line: str) -> tuple[str, str]:
         f" {key}={value}" for key, value in record.items() if key not in ("timestamp", "node")
     )
     return style, f"{event}{''.join(fields)}" + (f"\n{trace}" if trace else "")
+
+
+def format_log_time(line: str) -> str:
+    """Return the local time of a log line, or "" if the line has no time.
+
+    The date is included if it is not today.
+    """
+    try:
+        written = datetime.fromisoformat(json.loads(line)["timestamp"]).astimezone()
+    except (ValueError, KeyError, TypeError):
+        return ""
+    is_today = written.date() == datetime.now().astimezone().date()
+    shown = written.time() if is_today else written.replace(tzinfo=None)
+    return shown.isoformat(timespec="milliseconds")
 
 
 def _format_settings(node: ResolvedNode) -> str:

@@ -24,7 +24,7 @@ from flexsheet.launch.commands.graph import (
     run_node_here,
     running_graph,
 )
-from flexsheet.launch.commands.launching import format_log_line, run_graph
+from flexsheet.launch.commands.launching import format_log_line, format_log_time, run_graph
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
@@ -62,7 +62,8 @@ NodeArgument = Annotated[
 def status(run: options.RunOption = None, as_json: options.JsonOption = False) -> None:
     """Show the nodes of the running graph, with their message rates, lost messages and notes.
 
-    If messages were skipped or lost, a line under the table explains whether this matters.
+    If messages were skipped or lost, a line under the table names nodes and topics, and explains
+    whether this matters.
 
     The command also prints the problems that the self-checks of the nodes suspect. The exit code is
     1 if a problem is suspected, or if a node does not report its status. If several graphs are
@@ -92,6 +93,7 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
         )
     else:
         _print_shown(plan, found, live)
+        explanations = explain_counts(rows)
         for row in rows:
             row["publishes"] = [
                 describe_output(one) for one in row["outputs"] if one["topic"] != "status"
@@ -99,7 +101,7 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
             for name in ("inputs", "outputs", "errors"):
                 del row[name]
         print_rows(rows, as_json=False)
-        for line in explain_counts(rows):
+        for line in explanations:
             words.print(line)
         for host, reason in estops.items():
             words.print(f"e-stop on {host}: {reason}", style="red")
@@ -173,18 +175,47 @@ def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
 
 def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return an explanation of each nonzero message count in the table of `flexsheet status`."""
+    from flexsheet.messages.topics import Delivery, find_topic
+
+    superseded, overflowed, lost = list[str](), list[str](), list[str]()
+    for row in rows:
+        newest, every, missing = dict[str, int](), dict[str, int](), dict[str, int]()
+        for port in row["inputs"]:
+            is_every = find_topic(port["topic"]).delivery is Delivery.EVERY
+            if row["skipped"] and port["dropped"]:
+                (every if is_every else newest)[port["topic"]] = port["dropped"]
+            if row["lost"] and (count := port["gaps"] + port["rejected"]):
+                missing[port["topic"]] = count
+        for texts, counts in ((superseded, newest), (overflowed, every), (lost, missing)):
+            if counts:
+                texts.append(f"{row['node']} {_describe_counts(counts)}")
     lines = []
-    if any(row["skipped"] for row in rows):
+    if superseded:
         lines.append(
-            "skipped: newer messages replaced these messages before the node read them. This is "
-            "normal, unless the number grows all the time: then the computer is too busy."
+            f"skipped: {', '.join(superseded)}. A newer message replaced each before the node read "
+            "it, and the node needs only the newest. This is normal. If a number grows in each "
+            "call, the node is too slow: `flexsheet doctor`, row `load`, shows why."
         )
-    if lossy := [row["node"] for row in rows if row["lost"]]:
+    if overflowed:
         lines.append(
-            "lost: these messages were lost in transit or refused. This must not happen: see "
-            f"`flexsheet logs {lossy[0]}`."
+            f"skipped: {', '.join(overflowed)}. The node needed these messages, but was too slow "
+            f"to read them. Reduce the load of the computer: see `flexsheet doctor`, row `load`."
+        )
+    if lost:
+        lossy = next(row["node"] for row in rows if row["lost"])
+        lines.append(
+            f"lost: {', '.join(lost)}. These messages were lost in transit, or were not valid. "
+            f"This must not happen: `flexsheet logs {lossy}` shows the reason."
         )
     return lines
+
+
+def _describe_counts(counts: Mapping[str, int]) -> str:
+    """Return a text with the largest count, its topic, and the sum of the other counts."""
+    most = max(counts, key=lambda topic: counts[topic])
+    others = sum(counts.values()) - counts[most]
+    more = f" and {others} of other topics" if others else ""
+    return f"{counts[most]} of {most}{more}"
 
 
 def describe_output(port: dict[str, Any]) -> str:
@@ -236,7 +267,7 @@ def logs(
     run: options.RunOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Print the log of a node of the running graph, or list the nodes.
+    """Print the log of a node of the running graph with local times, or list the nodes.
 
     If no graph is running, the log is taken from the newest run.
     """
@@ -255,7 +286,8 @@ def logs(
         )
 
     def show(line: str) -> None:
-        print(line if as_json else format_log_line(line)[1], flush=True)
+        text = line if as_json else f"{format_log_time(line)} {format_log_line(line)[1]}".lstrip()
+        print(text, flush=True)
 
     with file.open(encoding="utf-8", errors="replace") as text:
         for line in deque(text, maxlen=lines):

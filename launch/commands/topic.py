@@ -293,6 +293,8 @@ def pub(
         _publish(found, built, run=run, rate_hz=rate or 1.0, times=times, on_sent=on_sent)
     )
     print_outcome({"topic": topic, "sent": sent}, f'sent {sent} on "{topic}"', as_json=as_json)
+    if not as_json:
+        words.print("if a node refuses the message, `flexsheet status` shows why", style="dim")
     raise typer.Exit(code)
 
 

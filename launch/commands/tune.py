@@ -100,6 +100,11 @@ def tune(
         tune.check_target(scene_file, target)  # fail before the long measurement
     if busy := describe_load():
         words.print(busy, style="yellow")
+    then = ", and then combined methods in a graph" if runs and not family else ""
+    words.print(
+        f"measuring {len(tunables)} method families{then}, which takes several minutes; the result "
+        "is written at the end"
+    )
     with progress_words() as progress:
         choices = tune.tune(scene, tunables, margin=margin, progress=progress)
         composition = None

@@ -46,6 +46,24 @@ of image correction that are compared.
 """
 
 
+STROKE_FIGURE = (
+    "errors of the sheet's position and angle during the strokes, and those of the paper"
+)
+LATENCY_FIGURE = "time from a camera image until the arms and the projected image react"
+EYE_FIGURE = "what the user sees on a tilted and on a pushed sheet, for each image correction"
+
+
+@dataclass(frozen=True, slots=True)
+class DemoFigure:
+    """A figure that the demo has drawn.
+
+    shows: description of the figure in words.
+    """
+
+    path: Path
+    shows: str
+
+
 @dataclass(slots=True)
 class DemoResult:
     """The results of all finished experiments of the demo.
@@ -56,7 +74,7 @@ class DemoResult:
 
     strokes: list[dict[str, Any]] = field(default_factory=list)
     followed: dict[str, Any] | None = None
-    images: list[Path] = field(default_factory=list)
+    figures: list[DemoFigure] = field(default_factory=list)
 
 
 Report = Callable[[DemoResult], None]
@@ -135,7 +153,8 @@ def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
     plot, latency = bag.parent / "stroke.png", bag.parent / "latency.png"
     draw_stroke(errors, plot)
     draw_latency(recording, latency)
-    return DemoResult(strokes=results[-1:], images=[plot, latency])
+    figures = [DemoFigure(plot, STROKE_FIGURE), DemoFigure(latency, LATENCY_FIGURE)]
+    return DemoResult(strokes=results[-1:], figures=figures)
 
 
 def evaluate_path(bag: Path, label: str) -> DemoResult | None:
@@ -151,7 +170,7 @@ def evaluate_path(bag: Path, label: str) -> DemoResult | None:
     write_file(bag.parent / "followed.json", json.dumps(followed, indent=1) + "\n")
     latency = bag.parent / "latency.png"
     draw_latency(stroke.read_recording(bag), latency)
-    return DemoResult(followed=followed, images=[latency])
+    return DemoResult(followed=followed, figures=[DemoFigure(latency, LATENCY_FIGURE)])
 
 
 def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
@@ -178,4 +197,4 @@ def evaluate_images(bag: Path, count: int) -> DemoResult | None:
         rows.append((f"sheet {series.name.format(value)}", [images[label] for label in labels]))
     views = bag.parent / "eye.png"
     draw_eye_views(rows, views)
-    return DemoResult(images=[views])
+    return DemoResult(figures=[DemoFigure(views, EYE_FIGURE)])

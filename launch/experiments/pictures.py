@@ -119,15 +119,24 @@ def draw_latency(recording: StrokeRecording, path: Path) -> None:
     for row, event in enumerate(events):
         delays_ms = recording.delays_s[event] * 1e3
         low, median, high = np.quantile(delays_ms, [0.01, 0.5, 0.99])
-        axes.barh(row, high - low, left=low, height=0.5, color="C0", alpha=0.4)
-        axes.plot([median, median], [row - 0.3, row + 0.3], color="C0", linewidth=2)
-        axes.text(high, row, f"  {median:.1f} / {high:.1f} ms", va="center", fontsize=8)
+        bar = axes.barh(row, high - low, left=low, height=0.5, color="C0", alpha=0.4)
+        (line,) = axes.plot([median, median], [row - 0.3, row + 0.3], color="C0", linewidth=2)
+        axes.text(
+            high, row, f"  median {median:.1f} ms, 99 %: {high:.1f} ms", va="center", fontsize=8
+        )
     axes.set_yticks(range(len(events)), events)
     axes.invert_yaxis()
     longest_ms = max(np.quantile(recording.delays_s[event], 0.99) for event in events) * 1e3
-    axes.set_xlim(0, 1.25 * longest_ms)
-    axes.set_xlabel("time since the centre of the exposure, ms: 1-99 % (bar), median (line)")
-    axes.set_title("Latency")
+    axes.set_xlim(0, 1.45 * longest_ms)
+    axes.set_xlabel("time since the centre of the exposure, ms")
+    axes.set_title("Latency: time from a camera image to the events that it causes")
+    figure.legend(
+        [line, bar[0]],
+        ["median", "1 % to 99 % of the images"],
+        loc="outside lower center",
+        ncols=2,
+        fontsize=8,
+    )
     axes.grid(visible=True, axis="x", alpha=0.2)
     figure.savefig(path, dpi=110)
 

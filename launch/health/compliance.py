@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flexsheet.launch.percent import format_percent
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration
@@ -53,11 +55,23 @@ SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """The push depths that the report lists, as fractions of the maximum push depth."""
 
 
+class ForceCurveStage(StrEnum):
+    """A stage of the computation of an object's force curve, as a text for the user."""
+
+    LINEAR = "computing the linear model of the soft object (only once)"
+    TABLE = "computing the nonlinear table of the soft object from simulated pushes (only once)"
+
+
+CurveProgress = Callable[[ForceCurveStage, int, int], None]
+"""A function that is called with the stage, and the numbers of its finished and of all steps."""
+
+
 def compute_front_curve(
     scene: Scene,
     cache_dir: Path | None = None,
     *,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: CurveProgress = lambda stage, done, total: None,
+    on_linear: Callable[[Floats], None] = lambda curve: None,
 ) -> Floats:
     """Return the force of the object as a function of push depth, on the side that faces the user.
 
@@ -66,8 +80,8 @@ def compute_front_curve(
     the object is used. If this table is not cached, its computation takes minutes.
 
     cache_dir: folder of the cache. If None, the user's cache folder is used.
-    on_progress: function that is called with the number of finished steps and the number of all
-        steps.
+    on_linear: function that is called with the force curve of the linear method, (n, 2), before
+        the nonlinear table is computed.
     """
     factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
@@ -78,9 +92,14 @@ def compute_front_curve(
         workers=0,
     )
     method, _ = choose_method(scene, "auto", SKIN_SPACING_M, compute_table=True)
-    best, *_ = factory.bodies(scene, method, lambda done, total, need: on_progress(done, total))
+
+    def report(stage: ForceCurveStage, done: int, total: int, need: str) -> None:
+        on_progress(stage, done, total)
+
+    best, *_ = factory.bodies(scene, method, partial(report, ForceCurveStage.LINEAR))
     if method != "linear" and best.method.name == "linear":
-        best = factory.build_table(scene, best, lambda done, total, need: on_progress(done, total))
+        on_linear(best.at_rest().force_curve)
+        best = factory.build_table(scene, best, partial(report, ForceCurveStage.TABLE))
     return best.at_rest().force_curve
 
 
@@ -217,20 +236,37 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     )
 
 
+def describe_estimate(scene: Scene, law: SheetForceModel, curve: Floats) -> str:
+    """Return a text with the rendering error for the linear model of the object, as an estimate.
+
+    law: force model of the sheet.
+    curve: force of the linear model as a function of push depth, rows of depth (m) and force (N).
+    """
+    shown = compute_compliance(scene, law, ObjectCurve.from_rows(curve))
+    error = float(np.abs(shown.centre.error_ratio).max())
+    return (
+        f"estimate by the linear model: maximum rendering error {format_percent(error)} at depths "
+        f"to {1e3 * shown.max_depth_m:.0f} mm, without delay; the nonlinear table, which takes "
+        "minutes, gives the result"
+    )
+
+
 def compliance_result(
     scene: Scene,
     law: SheetForceModel,
     curve: ObjectCurve,
     *,
     delay_s: float,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Return the result of `flexsheet doctor compliance --json`.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.
     delay_s: time from the measurement of a push depth until the sheet has moved.
+    progress: function that receives a text before a computation.
     """
-    table = load_or_compute_bounds(scene.camera.rate_hz, None)
+    table = load_or_compute_bounds(scene.camera.rate_hz, None, progress)
     shown = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     bandwidth, stable = shown.choose_bandwidth_rad_per_s()
     finding = find_loop_risk(scene, law, curve, table, delay_s)

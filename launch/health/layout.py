@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.percent import format_percent
 from flexsheet.messages.scene import Arms, ArmSpec, Pose, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
@@ -592,11 +593,11 @@ def draw_layout(layout: Layout, path: Path) -> None:
     for column, (side, reach) in enumerate(layout.arms()):
         upper, lower = panels[0, column], panels[1, column]
         upper.imshow(grid.colored(_binding_limits(reach), colors), **grid.frame)
-        upper.set_title(f"{side} arm: reaches {100 * reach.reachable.mean():.1f} %")
+        upper.set_title(f"{side} arm: reaches {format_percent(reach.reachable.mean())}")
         speeds = np.where(reach.reachable, 1e3 * layout.speeds_m_per_s(reach), np.nan)
         shown = lower.imshow(grid.minimum(speeds), vmin=0.0, vmax=2.0 * required, **grid.frame)
-        followed = 100 * reach.trackable.mean()
-        lower.set_title(f"{side} arm: follows {required:.0f} mm/s at {followed:.1f} %")
+        followed = format_percent(reach.trackable.mean())
+        lower.set_title(f"{side} arm: follows {required:.0f} mm/s at {followed}")
         lower.set_xlabel("tilt of the contact, degrees (positive: facing up)")
         panels[column, 0].set_ylabel("push depth, mm")
     figure.colorbar(shown, ax=panels[1], label="speed of the finger that the arm can follow, mm/s")
@@ -604,8 +605,8 @@ def draw_layout(layout: Layout, path: Path) -> None:
     legend += [Patch(color=color, label=LIMITS[n]) for n, color in colors.items()]
     panels[0, 1].legend(handles=legend, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     figure.suptitle(
-        f"{layout.scene.name}: both arms reach {100 * layout.reached.mean():.1f} % of the working "
-        "range"
+        f"{layout.scene.name}: both arms reach {format_percent(layout.reached.mean())} of the "
+        "working range"
     )
     figure.savefig(path, dpi=100)
 

@@ -63,7 +63,8 @@ def precompute_deflection_shapes(
     folder = None if cache_dir is None else Path(cache_dir)
     try:
         on_progress = report_time_left(
-            "computing the deflection shapes of the sheet (only once)", progress
+            "computing the deflection shapes of the sheet (only once, then the command continues)",
+            progress,
         )
         deflection_cache.load_or_compute(scene, folder, on_progress)
     except NoEquilibriumError as error:

@@ -76,7 +76,7 @@ FAULT_TEXTS = {
     ArmFault.STEP_SIZE: "step too large",
     ArmFault.NOT_FINITE: "command not finite",
     ArmFault.WATCHDOG: "watchdog: no command",
-    ArmFault.SERVO: "servo",
+    ArmFault.SERVO: "servo fault",
 }
 """The text of each fault, for logs and for `ArmState.faults`."""
 

@@ -159,7 +159,7 @@ class ArmBridge(Node):
     async def cycle(self) -> None:
         """Send periodic commands to the arm while no targets arrive."""
         if self._geometry is None:
-            self.note = "waiting for a scene"
+            self.note = NodeNote.WAITING_FOR_SCENE.phrase
             return
         now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
         if self._control.is_idle:
@@ -180,8 +180,9 @@ class ArmBridge(Node):
         doing = f"{control.mode} {control.reason}".rstrip()
         self.note = doing
         if self._failures:
-            counted = f"{self._failures} {NodeNote.FAILED_EXCHANGES.phrase}"
-            self.note += f"; {counted} (two in a row stop the arm)"
+            self.note += (
+                f"; {self._failures} {NodeNote.FAILED_EXCHANGES.phrase} (two in a row stop the arm)"
+            )
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
             state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)

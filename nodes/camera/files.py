@@ -271,7 +271,11 @@ class ImagesReader(FileReader):
                 f"the camera node's source has times ({source.times}) and rate_hz; remove one of "
                 "them"
             )
-        self._note = f"at {rate_hz:g} Hz" if source.times is None else "times of the CSV file"
+        self._note = (
+            f"at the set rate of {rate_hz:g} Hz"
+            if source.times is None
+            else "frame times of the CSV file"
+        )
         self._pairs = list(zip(left, right, times_ns, strict=True))
         self._loop, self._next = source.loop, 0
         self._clock = _LoopClock(rate_hz)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Positive, Scene, StereoCamera
 from flexsheet.messages.types import ParameterChange, StereoPair
 from flexsheet.nodes import NodeRole
@@ -116,9 +117,12 @@ class Camera(Node):
             fail=lambda error: later(self._report_failure, error),
             report=lambda text: later(self._report_opened, text),
             warn=lambda text: later(self._report_warning, text),
-            finish=lambda pairs: later(setattr, self, "note", f"ended after {pairs} pairs"),
+            finish=lambda pairs: later(self._report_end, pairs),
         )
         self.reader.start()
+
+    def _report_end(self, pairs: int) -> None:
+        self.note = f"{pairs} {NodeNote.SOURCE_ENDED.phrase}"
 
     def _report_failure(self, error: DeviceError) -> None:
         self.report_error("source", error)

@@ -31,7 +31,7 @@ from flexsheet.nodes.node import Input, Node, Output
 T = TypeVar("T")
 
 POLL_S = 0.05
-TABLE_NOTE = "; the nonlinear table is being computed"
+TABLE_NOTE = f"; {NodeNote.COMPUTING_TABLE.phrase}"
 BLEND_S = 5.0
 """The duration of the gradual transition between the responses of two methods, in seconds."""
 
@@ -71,7 +71,7 @@ class FemSolver(Node):
         self._fallback: DeadlineFallback
         self._set_bodies([])
         self._reset_contact()
-        self.note = "waiting for a scene"
+        self.note = NodeNote.WAITING_FOR_SCENE.phrase
 
     def _reset_contact(self) -> None:
         self._last: Response | None = None
@@ -121,7 +121,7 @@ class FemSolver(Node):
         self._reset_contact()
         await self._stop_table_task()
         if scene.object.material is None:
-            self.note = "no soft body: the object is rigid"
+            self.note = NodeNote.RIGID_OBJECT.phrase
             return
         p, factory = self.parameters, self._factory
         method, factory.skin_spacing_m = choose_method(
@@ -134,10 +134,10 @@ class FemSolver(Node):
                 partial(self.is_superseded, "scene"),
             )
         except precompute.Interrupted:
-            self.note = "precomputation interrupted"
+            self.note = NodeNote.COMPUTATION_INTERRUPTED.phrase
             return
         except Exception as error:
-            self.note = f"no soft body: {error}"
+            self.note = f"{NodeNote.SOFT_BODY_FAILED.phrase} {error}"
             raise
         self._set_bodies(bodies)
         self.note += factory.pending_note(scene, method, bodies)
@@ -154,6 +154,10 @@ class FemSolver(Node):
         """
         loop = asyncio.get_running_loop()
         stop = self._stop
+        self.log.info(
+            "computes the nonlinear table of the soft body in the background, which takes minutes; "
+            "the graph works meanwhile, and `flexsheet status` shows the progress"
+        )
 
         async def adopt(quick: body.SceneBody) -> None:
             if not stop.is_set():
@@ -172,7 +176,7 @@ class FemSolver(Node):
                 on_quick,
             )
         except precompute.Interrupted:
-            self.note = "the nonlinear table was interrupted; the next start continues it"
+            self.note = f"{NodeNote.TABLE_INTERRUPTED.phrase}; the next start continues it"
         except Exception as error:
             self.report_error("nonlinear_table", error)
         else:
@@ -182,8 +186,9 @@ class FemSolver(Node):
         if stop.is_set() or self._stop.is_set():
             raise precompute.Interrupted
         eta = self._eta.text(done, total, self.clock.now_ns() * 1e-9)
-        now = "".join(f"; now {self._describe(one)}" for one in [*self._bodies.values()][:1])
-        self.note = f"precomputing the soft body: {eta} ({need}){now}"
+        now = [self._describe(one) for one in self._bodies.values()]
+        until_then = f"; the graph works until then with {now[0]}" if now else ""
+        self.note = f"{NodeNote.COMPUTING_SOFT_BODY.phrase} {eta} ({need}){until_then}"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:

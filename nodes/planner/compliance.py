@@ -26,6 +26,7 @@ import numpy as np
 import scipy
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBounds
@@ -555,7 +556,8 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
         )
         kind, than = ("stiffer", "too soft") if error[at] < 0.0 else ("softer", "too stiff")
         return (
-            f"object is {kind} than the sheet can render: {100 * abs(error[at]):.0f} % {than} at "
+            f"object is {kind} {NodeNote.FORCE_NOT_RENDERED.phrase} "
+            f"{100 * abs(error[at]):.0f} % {than} at "
             f"{1e3 * rendered.depths_m[at]:.0f} mm ({rendered.force_n[at]:.2f} of "
             f"{rendered.object_force_n[at]:.2f} N), maximum {100 * np.abs(error).max():.0f} %; "
             f"{cause}; users notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
@@ -563,7 +565,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
     uncertainty = compute_force_uncertainty_ratio(rendered, position_error_m)
     if uncertainty > WEBER_RATIO:
         return (
-            f"object is too soft for the position tolerance: {1e3 * position_error_m:g} mm of the "
+            f"object {NodeNote.TOO_SOFT_FOR_POSITION.phrase} {1e3 * position_error_m:g} mm of the "
             f"sheet's position changes the force at {1e3 * rendered.depths_m[-1]:.0f} mm by "
             f"{100 * uncertainty:.0f} %; users notice {100 * WEBER_RATIO:.0f} to "
             f"{100 * WEBER_RATIO_BARE:.0f} %"
@@ -597,11 +599,11 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, s
     stretch = min(max(desired, least), largest)
     force = edge_force_n(stretch, sheet)
     rendered = push_stiffness_n_per_m(force, width_m=sheet.width_m)
-    note = ""
     if desired < least:
-        note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet, {rendered:.0f} N/m"
+        problem = NodeNote.SOFTER_THAN_SHEET
     elif desired > largest:
-        note = (
-            f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet, {rendered:.0f} N/m"
-        )
+        problem = NodeNote.STIFFER_THAN_SHEET
+    else:
+        return stretch, ""
+    note = f"object of {stiffness_n_per_m:.0f} N/m {problem.phrase}, {rendered:.0f} N/m"
     return stretch, note

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.methods import SheetForceMethod
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import Specification, advise_precompute, cached, load_cached
 from flexsheet.nodes.methods import Progress
@@ -105,6 +106,6 @@ def load_force_model(
     entry = make_table_cache(scene)
     table = load_cached(entry, cache_dir) or load_cached(entry, FOLDER)
     if table is None:
-        note = f"scaled; the table of the sheet's force is missing; {advise_precompute(scene)}"
+        note = f"scaled; {NodeNote.FORCE_TABLE_MISSING.phrase}; {advise_precompute(scene)}"
         return ScaledSheetModel(rubber), note
     return table, method

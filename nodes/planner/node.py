@@ -9,6 +9,7 @@ import scipy
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.methods import SheetForceMethod, resolve_method
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.messages.types import (
@@ -91,7 +92,7 @@ class Planner(Node):
         )
         fixed_s = self.parameters.prediction_horizon_s
         self._horizon_s = FIRST_HORIZON_S if fixed_s is None else fixed_s
-        self._late_count, self._model_note = 0, ""
+        self._late_count, self._model_text = 0, ""
         self._stopped_oscillations = 0
         path = self.parameters.sheet_calibration
         self._calibration: SheetCalibration | None = None
@@ -106,9 +107,9 @@ class Planner(Node):
             method: SheetForceMethod = resolve_method(
                 self.parameters.sheet_force, scene.methods.sheet_force, "scaled"
             )
-            model, self._model_note = load_force_model(scene, method, self.parameters.cache_dir)
+            model, self._model_text = load_force_model(scene, method, self.parameters.cache_dir)
         else:
-            model, self._model_note = make_force_model(scene.sheet, self._calibration), "calibrated"
+            model, self._model_text = make_force_model(scene.sheet, self._calibration), "calibrated"
         measured = None if self._calibration is None else self._calibration.hysteresis_ratio
         mode = self.parameters.choose_compliance(scene)
         bounds = None
@@ -144,14 +145,14 @@ class Planner(Node):
             self._force_check.add_force(force, header.source_ns)
 
     def _update_note(self) -> None:
-        late = f"{self._late_count} late fingertips dropped" if self._late_count else ""
+        late = ""
+        if self._late_count:
+            late = f"{NodeNote.LATE_FINGERTIPS.phrase} {self._late_count}"
         compliance = self._compliance.note if self._compliance is not None else ""
-        stopped = (
-            f"{self._stopped_oscillations} oscillations of finger and sheet stopped"
-            if self._stopped_oscillations
-            else ""
-        )
-        model = f"sheet force model: {self._model_note}"
+        stopped = ""
+        if self._stopped_oscillations:
+            stopped = f"{NodeNote.OSCILLATIONS_STOPPED.phrase} {self._stopped_oscillations}"
+        model = f"{NodeNote.FORCE_MODEL.phrase} {self._model_text}"
         self.note = "; ".join(filter(None, (compliance, late, stopped, model)))
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:

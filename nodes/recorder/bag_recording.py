@@ -55,7 +55,7 @@ class BagRecording:
         self._retry_ns = self._bag_started_ns = 0
         self.requested = False
         self.lost = 0
-        self.note = "waits for a request to record"
+        self.note = NodeNote.RECORDER_WAITS.phrase
 
     @property
     def path(self) -> Path | None:
@@ -90,7 +90,7 @@ class BagRecording:
                 self.requested, bag, self._bag = False, self._bag, None
                 if bag is not None:
                     bag.close()
-                    self.note = f"recorded {bag.messages} messages in {bag.path}"
+                    self.note = f"{NodeNote.RECORDED.phrase} {bag.messages} messages in {bag.path}"
         except (BagError, OSError) as error:
             self._end_bag(error)
 
@@ -146,7 +146,7 @@ class BagRecording:
             except (BagError, OSError) as error:
                 self._end_bag(error)
             else:
-                self.note = f"{self._bag.messages} messages in {self._bag.path}"
+                self._note_progress(self._bag)
                 return False
         self.lost += self.requested
         return self.requested
@@ -171,7 +171,10 @@ class BagRecording:
         for topic, frames, header in self._latched.values():
             bag.write_frames(topic, frames, header, self._clock.now_ns())
         bag.flush()
-        self.note = f"recording to {bag.path}"
+        self._note_progress(bag)
+
+    def _note_progress(self, bag: BagWriter) -> None:
+        self.note = f"{NodeNote.RECORDING.phrase} {bag.messages} messages in {bag.path}"
 
     def _end_bag(self, error: Exception) -> None:
         bag, self._bag = self._bag, None

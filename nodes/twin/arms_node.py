@@ -15,6 +15,7 @@ from pydantic import AfterValidator, Field
 
 from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes import NodeRole
@@ -255,7 +256,7 @@ class TwinArmsNode(Node):
     @periodic("rate_hz")
     async def cycle(self) -> None:
         if len(self.servers) < 2:
-            self.note = "waits for a scene"
+            self.note = NodeNote.WAITING_FOR_SCENE.phrase
             return
         for side in self.servers:
             self._advance(side)
@@ -282,6 +283,6 @@ class TwinArmsNode(Node):
             )
         )
         self.note = ", ".join(
-            f"{side}: {server.controller.commands} commands, {server.controller.refused} refused"
-            for side, server in self.servers.items()
+            f"{side}: {one.commands} {NodeNote.ARM_COMMANDS.phrase} {one.refused}"
+            for side, one in ((side, server.controller) for side, server in self.servers.items())
         )

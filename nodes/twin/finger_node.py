@@ -26,7 +26,12 @@ from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
-from flexsheet.nodes.twin.finger import FingerMotion, FingerState, find_tremor_m
+from flexsheet.nodes.twin.finger import (
+    FingerMotion,
+    FingerPathError,
+    FingerState,
+    find_tremor_m,
+)
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, HandImpedance, TrueSheet
 from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.nail import Nail
@@ -93,6 +98,7 @@ class TwinFingerNode(Node):
     motion_from_ns = 0
     path_label = ""
     path_stroke_s: float | None = None
+    refusal = ""
     missed_frames = 0
     coupled: CoupledFinger | None = None
     preparing: asyncio.Task[None] | None = None
@@ -174,8 +180,15 @@ class TwinFingerNode(Node):
 
     def _follow_waiting(self) -> None:
         path, self.waiting = self.waiting, None
-        if path is not None:
+        if path is None:
+            return
+        self.refusal = ""
+        try:
             self._follow(path)
+        except FingerPathError as error:
+            self.refusal = f'{NodeNote.FINGER_PATH_REFUSED.phrase} "{path.label}": {error}'
+            self.log.warning("finger path", problem=self.refusal)
+        self._update_note()
 
     def _seconds(self, at_ns: int) -> float:
         return (at_ns - self.started_ns) * 1e-9
@@ -341,12 +354,21 @@ class TwinFingerNode(Node):
         read_out_ns = start_ns + self.exposure_ns + round(1e9 * self._read_out_s)
         await self._sleep_until(read_out_ns)
         self.twin__stereo.publish(pair, source_ns=middle_ns)
-        parts = [f'path "{self.path_label}"'] if self.path_label else []
+        self._update_note()
+
+    def _update_note(self) -> None:
+        parts = []
+        if self.path_label:
+            parts.append(f'{NodeNote.FOLLOWS_PATH.phrase} "{self.path_label}"')
         if self.missed_frames:
-            missed = f"{self.missed_frames} {NodeNote.FRAMES_MISSED.phrase}"
-            parts.append(f"{missed} because the computer was busy")
+            parts.append(
+                f"{self.missed_frames} {NodeNote.FRAMES_MISSED.phrase} because the computer was "
+                "busy"
+            )
         if self.parameters.hand == "coupled" and self.coupled is None:
-            parts.append("the force of the sheet on the finger is being computed")
+            parts.append(NodeNote.COMPUTING_SHEET_REACTION.phrase)
+        if self.refusal:
+            parts.append(self.refusal)
         self.note = ", ".join(parts)
 
     async def _sleep_until(self, at_ns: int) -> None:

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from flexsheet.messages.apparatus import Apparatus, GaugeTruth
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.types import Force, TwinArms, TwinFinger
 from flexsheet.nodes.arrays import Floats
@@ -99,7 +100,7 @@ class TwinGauge(Node):
     async def measure(self) -> None:
         finger, arms = self.twin__finger, self.twin__arms
         if self._sheet is None or finger.message is None or arms.message is None:
-            self.note = "waits for the scene, the finger and the arms"
+            self.note = f"{NodeNote.WAITING_FOR_SCENE.phrase}, the finger and the arms"
             return
         assert finger.header is not None
         taken_ns = finger.header.source_ns

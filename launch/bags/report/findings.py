@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from flexsheet.launch.experiments.stroke import ARM_EVENTS
+from flexsheet.launch.percent import format_percent
 
 Gravity = Literal["bad", "doubtful"]
 
@@ -244,7 +245,10 @@ def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     body = numbers["soft_body"]
     if body["out_of_range"]:
         ratio = body["out_of_range"] / sum(body["methods"].values())
-        text = f"The soft body's method was outside its valid range in {ratio:.1%} of the results."
+        text = (
+            "The soft body's method was outside its valid range in "
+            f"{format_percent(ratio)} of the results."
+        )
         yield SessionFinding("doubtful", text, "nodes")
 
 
@@ -255,14 +259,15 @@ def _check_finger(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     if total and sum(missed.values()) > MAX_UNSEEN_RATIO * total:
         worst = max(missed, key=lambda reason: missed[reason])
         ratio = sum(missed.values()) / total
-        text = f"{ratio:.1%} of the images had no valid finger; the main reason is: {worst}."
+        percent = format_percent(ratio)
+        text = f"{percent} of the images had no valid finger; the main reason is: {worst}."
         yield SessionFinding("doubtful", text, "sheet")
     for path in numbers["sheet"]["followed"]:
         if path["drop_outs"]:
             times = _times(path["drop_outs"])
             text = (
                 f'On the path "{path["path"]}" the arms stopped following in contact {times}; '
-                f"they followed for {path['following_ratio']:.1%} of the contact."
+                f"they followed for {format_percent(path['following_ratio'])} of the contact."
             )
             yield SessionFinding("doubtful", text, "sheet")
     frames = numbers["frames"]
