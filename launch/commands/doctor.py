@@ -20,7 +20,7 @@ from flexsheet.launch.commands.output import (
     progress_words,
     words,
 )
-from flexsheet.launch.percent import format_percent
+from flexsheet.messages.units import format_percent
 
 if TYPE_CHECKING:
     from flexsheet.launch.health.layout import Layout

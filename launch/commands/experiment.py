@@ -18,8 +18,8 @@ from flexsheet.launch.commands.output import (
     shown,
     words,
 )
-from flexsheet.launch.percent import format_percent
 from flexsheet.launch.plans.features import Feature
+from flexsheet.messages.units import format_percent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

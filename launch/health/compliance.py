@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from flexsheet.launch.percent import format_percent
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration
+from flexsheet.messages.units import format_percent
 from flexsheet.nodes import cache
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import load_cached

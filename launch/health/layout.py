@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.percent import format_percent
 from flexsheet.messages.scene import Arms, ArmSpec, Pose, Scene
 from flexsheet.messages.types import Side
+from flexsheet.messages.units import format_percent
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.reach import (
     LIMITS,

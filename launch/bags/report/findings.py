@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from flexsheet.launch.experiments.stroke import ARM_EVENTS
-from flexsheet.launch.percent import format_percent
+from flexsheet.messages.units import format_percent
 
 Gravity = Literal["bad", "doubtful"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from flexsheet.launch.percent import format_percent
+from flexsheet.messages.units import format_percent
 
 
 @pytest.mark.parametrize(
