@@ -13,7 +13,13 @@ from typing import get_args
 import pytest
 
 from flexsheet.launch import cli
-from flexsheet.launch.commands.explain import Entry, entries, explain, find_entries
+from flexsheet.launch.commands.explain import (
+    Entry,
+    entries,
+    explain,
+    find_entries,
+    state_problem,
+)
 from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError
 from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.bag import BagError
@@ -112,9 +118,16 @@ def test_without_an_argument_all_codes_are_listed_with_their_meaning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     explain(message=None)
-    lines = capsys.readouterr().out.splitlines()[1:]
+    printed = capsys.readouterr()
+    assert "to print the remedy: flexsheet explain CODE" in printed.err
+    lines = printed.out.splitlines()[1:]
     assert [line.split()[0] for line in lines] == [entry.code for entry in entries()]
     assert all(len(line.split()) > 2 for line in lines)
+
+
+def test_meanings_state_the_problem_without_terms_of_the_source_code() -> None:
+    assert state_problem("Raised if a bag cannot be read.") == "A bag cannot be read."
+    assert not any("aised if" in one.meaning for one in entries())
 
 
 def test_an_unknown_code_points_to_the_list_and_to_a_similar_code() -> None:
@@ -155,7 +168,7 @@ def test_an_entry_of_an_error_has_the_first_paragraph_of_its_class() -> None:
     assert (
         Entry(
             code="unknown-topic",
-            meaning=" ".join((UnknownTopicError.__doc__ or "").split()),
+            meaning=state_problem(" ".join((UnknownTopicError.__doc__ or "").split())),
             remedy=UnknownTopicError.remedy,
             name="UnknownTopicError",
             phrase="unknown topic",

@@ -23,9 +23,13 @@ from flexsheet.launch.commands.output import (
     print_fields,
     print_json,
     print_table,
+    words,
 )
 
 app = make_app()
+
+RAISED_IF = re.compile(r"(?:The error raised|Raised) (?:if|after) ")
+"""The beginning of an error class's docstring, which does not concern users."""
 
 LAYERS = ("messages", "nodes", "launch")
 
@@ -104,9 +108,19 @@ def _error_entries() -> list[Entry]:
                 for key in ("code", "remedy", "phrase")
                 if key in values
             }
-            meaning = (ast.get_docstring(statement) or "").split("\n\n")[0]
-            found.append(Entry(meaning=" ".join(meaning.split()), name=statement.name, **texts))
+            described = (ast.get_docstring(statement) or "").split("\n\n")[0]
+            meaning = state_problem(" ".join(described.split()))
+            found.append(Entry(meaning=meaning, name=statement.name, **texts))
     return sorted(found, key=lambda entry: entry.code)
+
+
+def state_problem(described: str) -> str:
+    """Return the problem that the docstring of an error class describes, as a sentence.
+
+    For example, "Raised if a bag cannot be read." becomes "A bag cannot be read.".
+    """
+    problem = RAISED_IF.sub("", described)
+    return problem[:1].upper() + problem[1:]
 
 
 def find_entries(text: str) -> list[Entry]:
@@ -177,6 +191,7 @@ def explain(
         print_json(rows)
     elif message is None:
         print_table(("code", "meaning"), [(one.code, _first_sentence(one)) for one in found])
+        words.print("to print the remedy: flexsheet explain CODE")
     else:
         for number, row in enumerate(rows):
             if number:

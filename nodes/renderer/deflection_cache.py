@@ -6,7 +6,6 @@ For other radii, the stored shapes are interpolated. For other widths, they are 
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
@@ -173,18 +172,12 @@ def load_or_compute(
     )
 
 
-def _init_worker() -> None:
-    # Ctrl-C reaches all processes of a terminal, but the parent process ends its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    enter_background()
-
-
 def _load_or_solve(scene: Scene, cache_dir: Path | None, progress: Progress) -> IndentationBasis:
     rubber, within = required_shapes(scene)
 
     def solve_all(pushes: Sequence[IndentationCase]) -> Iterator[Floats]:
         with ProcessPoolExecutor(
-            mp_context=get_context("spawn"), initializer=_init_worker
+            mp_context=get_context("spawn"), initializer=enter_background
         ) as workers:
             for done, solved in enumerate(workers.map(solve_indentation, pushes), start=1):
                 progress(done, len(pushes))
