@@ -36,6 +36,14 @@ class Message(BaseModel):
         extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True
     )
 
+    def find_problem(self) -> str:
+        """Return why no node can use the message, or "" if there is no such reason.
+
+        A message with a problem can be decoded, so that a bag that contains it stays readable.
+        `flexsheet topic pub` does not send it.
+        """
+        return ""
+
 
 class MessagePart(BaseModel):
     """The base class of named groups of fields in a message."""

@@ -9,11 +9,11 @@ user's fingertip over the virtual object.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flexsheet.messages import methods
 from flexsheet.messages.arrays import (
@@ -788,22 +788,22 @@ class FingerPath(Message):
         default=None, description="duration of the motion, if the path is a stroke of an experiment"
     )
 
-    @model_validator(mode="after")
-    def _check_times(self) -> Self:
+    def find_problem(self) -> str:
+        """Return why the times are not valid: one increasing time per point is required."""
         times_s, points = self.times_s, len(self.positions_world_m)
         if len(times_s) != points or points == 0:
-            raise ValueError(
+            return (
                 f"times_s: {len(times_s)} times for {points} points in positions_world_m; give "
                 "one time per point, and at least one point"
             )
         wrong = np.flatnonzero(np.diff(times_s) <= 0.0)
         if len(wrong):
             at = int(wrong[0])
-            raise ValueError(
+            return (
                 f"times_s[{at + 1}]: {times_s[at + 1]:.6g} does not come after times_s[{at}] = "
                 f"{times_s[at]:.6g}; give increasing times"
             )
-        return self
+        return ""
 
 
 class TwinFinger(Message):

@@ -576,9 +576,11 @@ def _parse_message(topic: Topic, text: str) -> Message:
         raise CommandError(
             f"{source}: expected a mapping with the fields of {topic.message.__name__}"
         )
-    return validate(
-        topic.message, Document(Path(f"{source} ({topic.message.__name__})"), value, text, {})
-    )
+    origin = f"{source} ({topic.message.__name__})"
+    message = validate(topic.message, Document(Path(origin), value, text, {}))
+    if problem := message.find_problem():
+        raise CommandError(f"{origin}: {problem}")
+    return message
 
 
 async def _publish(
