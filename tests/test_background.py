@@ -12,7 +12,7 @@ import pytest
 
 from flexsheet.launch.running import priority
 from flexsheet.nodes.background import MAX_NICE, enter_background, enter_real_time, leave_real_time
-from flexsheet.nodes.fem_solver.precompute_table import local_processes
+from flexsheet.nodes.worker_processes import local_processes
 
 
 def priority_in(workers: Executor) -> tuple[int, int]:

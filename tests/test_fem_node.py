@@ -19,7 +19,7 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
-from flexsheet.nodes.fem_solver import precompute, precompute_table, snapshots
+from flexsheet.nodes.fem_solver import precompute, snapshots, soft_body_factory
 from flexsheet.nodes.fem_solver.body import SceneBody
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import Response
@@ -325,7 +325,7 @@ def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
     # Processes in the background take minutes to start beside other tests.
     monkeypatch.setattr(
-        precompute_table, "local_processes", lambda count: nullcontext(InlineExecutor())
+        soft_body_factory, "local_processes", lambda count: nullcontext(InlineExecutor())
     )
 
 

@@ -29,7 +29,6 @@ from flexsheet.nodes.fem_solver.precompute import Interrupted, SoftBodyModel, co
 from flexsheet.nodes.fem_solver.precompute_table import (
     TableSpec,
     compute_table,
-    local_processes,
     make_table_cache,
     solve_all,
 )
@@ -43,6 +42,7 @@ from flexsheet.nodes.fem_solver.table import (
     count_valid_levels,
     find_mirror_images,
 )
+from flexsheet.nodes.worker_processes import local_processes
 from tests.soft_bodies import InlineExecutor, cylinder_spec
 from tests.waiting import wait_until
 

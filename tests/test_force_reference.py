@@ -24,7 +24,7 @@ from flexsheet.launch.experiments.compliance import POSITIONS_M
 from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Cylinder
-from flexsheet.nodes.fem_solver import precompute_table
+from flexsheet.nodes.fem_solver import soft_body_factory
 from flexsheet.nodes.fem_solver.body import SceneBody, make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
@@ -168,7 +168,7 @@ def test_the_stated_errors_hold_at_the_references_positions(
 ) -> None:
     """The quick table uses the shipped pushes of the demo."""
     monkeypatch.setattr(
-        precompute_table, "local_processes", lambda count: nullcontext(InlineExecutor())
+        soft_body_factory, "local_processes", lambda count: nullcontext(InlineExecutor())
     )
     scene, bodies = load_scene(SCENE_FILE), []
     factory = SoftBodyFactory(0.0045, tmp_path)

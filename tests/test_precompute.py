@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch import cli
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.nodes.fem_solver import body, precompute_table, snapshots
+from flexsheet.nodes.fem_solver import body, precompute_table, snapshots, soft_body_factory
 from flexsheet.nodes.fem_solver.mesh import cylinder
 from tests.scenes import load_values
 from tests.soft_bodies import InlineExecutor
@@ -36,7 +36,7 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     )
     # other processes take seconds to start
     monkeypatch.setattr(
-        precompute_table, "local_processes", lambda count: nullcontext(InlineExecutor())
+        soft_body_factory, "local_processes", lambda count: nullcontext(InlineExecutor())
     )
     content = load_values()
     content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
@@ -78,7 +78,7 @@ def test_the_table_is_computed_once_in_the_nodes_cache(
     assert path.exists()
     assert path.name in printed.replace(" ", "")
     made = path.stat().st_mtime_ns
-    monkeypatch.setattr(precompute_table, "local_processes", pytest.fail)
+    monkeypatch.setattr(soft_body_factory, "local_processes", pytest.fail)
     assert flexsheet(*arguments)[0] == 0
     assert path.stat().st_mtime_ns == made
 

@@ -8,31 +8,17 @@ snapshot is stored when it is finished.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.background import enter_background
 from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields
 from flexsheet.nodes.fem_solver import precompute, snapshots
 from flexsheet.nodes.fem_solver.contact import unit_linear_body
@@ -75,43 +61,8 @@ class TableSpec:
         return [VERSION, self.body.key(), self.finger_radius_m]
 
 
-@contextmanager
-def local_processes(count: int) -> Iterator[Executor]:
-    """Yield an executor with `count` processes on this computer.
-
-    If the context exits with an exception, the processes stop and do not finish their jobs.
-    """
-    context = multiprocessing.get_context("spawn")
-    stop = context.Event()
-    executor = ProcessPoolExecutor(count, context, initializer=_init_worker, initargs=(stop,))
-    try:
-        yield executor
-    except BaseException:
-        stop.set()
-        raise
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
-
-
 stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", default=lambda: False)
 """A function that returns whether a worker must stop its current job."""
-
-
-def _init_worker(stop: Event) -> None:
-    # Ctrl-C reaches all processes of a terminal, but the parent process stops its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    enter_background()
-    threading.Thread(target=_exit_on, args=(stop,), name="stop", daemon=True).start()
-
-
-def _exit_on(stop: Event) -> None:
-    """Exit the worker process as soon as the event `stop` is set.
-
-    This is necessary because a job checks only after each push depth whether it must stop. One push
-    depth can take a minute. The parent process stores finished results.
-    """
-    stop.wait()
-    os._exit(0)
 
 
 def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:

@@ -29,7 +29,7 @@ from flexsheet.nodes.fem_solver.body import SceneBody, attach_table, make_table_
 from flexsheet.nodes.fem_solver.contact import unit_linear_body
 from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel
-from flexsheet.nodes.fem_solver.precompute_table import local_processes, make_table_cache, solve_all
+from flexsheet.nodes.fem_solver.precompute_table import make_table_cache, solve_all
 from flexsheet.nodes.fem_solver.snapshot_interpolator import (
     NEIGHBOURS,
     SnapshotSet,
@@ -38,6 +38,7 @@ from flexsheet.nodes.fem_solver.snapshot_interpolator import (
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob
 from flexsheet.nodes.fem_solver.table import CANDIDATE_FACES, END_SPAN_M, Table, fill_table
 from flexsheet.nodes.methods import Progress
+from flexsheet.nodes.worker_processes import local_processes
 
 VERSION = 3
 

@@ -19,6 +19,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import advise_precompute, load_cached
 from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 from flexsheet.nodes.fem_solver.table import Table
+from flexsheet.nodes.worker_processes import local_processes
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
 """A soft-body method, or `auto`. The value `auto` selects the nonlinear table if the table is
@@ -178,7 +179,7 @@ class SoftBodyFactory:
                 yield executor, 0
             return
         workers = self.workers or os.cpu_count() or 1
-        with precompute_table.local_processes(workers) as executor:
+        with local_processes(workers) as executor:
             yield executor, workers
 
 

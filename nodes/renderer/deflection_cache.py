@@ -6,17 +6,15 @@ For other radii, the stored shapes are interpolated. For other widths, they are 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.background import enter_background
 from flexsheet.nodes.cache import Specification, cached, load_cached
 from flexsheet.nodes.models.sheet.indentation import (
     IndentationBasis,
@@ -26,6 +24,7 @@ from flexsheet.nodes.models.sheet.indentation import (
     solve_indentation_basis,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.worker_processes import local_processes
 
 VERSION = 2
 """The version of the computation, which is part of the cache key. Increase it when results for the
@@ -176,9 +175,7 @@ def _load_or_solve(scene: Scene, cache_dir: Path | None, progress: Progress) -> 
     rubber, within = required_shapes(scene)
 
     def solve_all(pushes: Sequence[IndentationCase]) -> Iterator[Floats]:
-        with ProcessPoolExecutor(
-            mp_context=get_context("spawn"), initializer=enter_background
-        ) as workers:
+        with local_processes(os.cpu_count() or 1) as workers:
             for done, solved in enumerate(workers.map(solve_indentation, pushes), start=1):
                 progress(done, len(pushes))
                 yield solved
