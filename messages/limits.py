@@ -7,6 +7,7 @@ cause numerical errors in the nodes, such as overflow.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cache
 from typing import Annotated, Any, get_args, get_origin
@@ -23,6 +24,9 @@ MAX_LENGTH_M = 10.0
 
 MAX_ANGLE_RAD = 7.0
 """The maximum angle (rad): a full rotation plus a margin for rounding."""
+
+MAX_ANGLE_DEG = 360.0
+"""The maximum number that is understood as an angle in degrees by mistake."""
 
 MAX_DURATION_S = 86_400.0
 MAX_RATE_HZ = 10_000.0
@@ -95,7 +99,18 @@ MAX_BY_UNIT = {
 If one suffix ends with another suffix, the longer suffix is listed first.
 """
 
-MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
+MIN_STRESS_PA = 100.0
+"""The minimum elastic modulus (Pa). The softest tissues have a few hundred pascal, so a smaller
+number is probably in kPa or MPa."""
+
+MIN_BY_UNIT = {
+    "metres_per_px": 1e-6,
+    "_m": 1e-6,
+    "_s": 1e-9,
+    "_hz": 1e-3,
+    "_px": 1e-3,
+    "_pa": MIN_STRESS_PA,
+}
 """The minimum value of a positive number for each unit suffix of a field's name.
 
 The values are below the resolution of any device.
@@ -143,8 +158,12 @@ class LimitedModel(BaseModel):
 
 def _check_number(value: float, name: str) -> None:
     if not abs(value) <= find_max_magnitude(name):
+        unit = _unit_text(name)
+        hint = ""
+        if name.endswith("_rad") and abs(value) <= MAX_ANGLE_DEG:
+            hint = f"; {value:g}° are {math.radians(value):.4g} rad"
         raise ValueError(
-            f"give at most {find_max_magnitude(name):g}{_unit_text(name)}, and a finite number"
+            f"give at most {find_max_magnitude(name):g}{unit}, and a finite number{hint}"
         )
 
 
