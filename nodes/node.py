@@ -46,6 +46,7 @@ from pydantic import ConfigDict
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Delivery, Topic, find_topic
@@ -524,10 +525,14 @@ class Node:
         await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Count an error, report it in the status message, and log it with its traceback."""
+        """Count an error, report it in the status message, and log it.
+
+        The log has no traceback of a FlexsheetError, whose text states a remedy.
+        """
         self.errors += 1
         self.last_error = f"{what}: {type(error).__name__}: {error}"
-        self.log.error("handler failed", what=what, error=str(error), exc_info=error)
+        trace = None if isinstance(error, FlexsheetError) else error
+        self.log.error("handler failed", what=what, error=str(error), exc_info=trace)
 
     def is_superseded(self, port: str) -> bool:
         """Return whether a newer message waits for the coroutine handler of a port.

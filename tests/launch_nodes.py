@@ -89,6 +89,14 @@ class MisspelledHandler(Beacon):
         raise AssertionError("no message can arrive")
 
 
+class MisspelledRate(Beacon):
+    """A node with a periodic method whose rate is not a parameter."""
+
+    @periodic("rate_hs")
+    async def show(self) -> None:
+        raise AssertionError("the graph is not started")
+
+
 class UnreachableParameter(Beacon):
     """A node with a live parameter, but without an input for its changes."""
 

@@ -158,6 +158,7 @@ def test_without_a_graph_there_is_nothing_to_stop() -> None:
     done = subprocess.run([*FLEXSHEET, "arms", "stop"], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "no graph is running" in done.stderr
+    assert "use the hard-wired e-stop" in done.stderr
 
 
 class Sockets:

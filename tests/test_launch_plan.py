@@ -385,6 +385,13 @@ def test_a_handler_without_an_input_is_an_error_with_the_similar_name(tmp_path: 
     assert 'did you mean "on_scene"' in found
 
 
+def test_a_periodic_method_needs_a_parameter_with_its_rate(tmp_path: Path) -> None:
+    text = GRAPH.replace(f"type: {BEACON}", "type: tests.launch_nodes:MisspelledRate")
+    found = complaint(tmp_path, text)
+    assert 'periodic with the rate "rate_hs", which is not a parameter of the node; ' in found
+    assert 'did you mean "rate_hz"' in found
+
+
 def test_live_parameters_need_an_input_for_their_changes(tmp_path: Path) -> None:
     text = GRAPH.replace(f"type: {BEACON}", "type: tests.launch_nodes:UnreachableParameter")
     assert "declare parameter: Input[ParameterChange] in the class" in complaint(tmp_path, text)

@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from flexsheet.launch.commands.graph import choose_run, run_interruptible, running_graph
+from flexsheet.launch.commands.graph import (
+    NoGraphError,
+    choose_run,
+    run_interruptible,
+    running_graph,
+)
 from flexsheet.launch.commands.options import (
     ChangedRunOption,
     JsonOption,
@@ -143,7 +148,12 @@ async def _confirm_stops(
     from flexsheet.launch.running.stopping import StopOutcome
 
     ready = [one.directory for one in list_live_runs() if one.plan_file.is_file()]
-    # Without a running graph, `running_graph` raises the error.
+    if run_directory is None and not list_live_runs():
+        raise NoGraphError(
+            "no graph is running on this computer, so no arm can be stopped by it; use the "
+            "hard-wired e-stop of an arm that moves"
+        )
+    # If the graph is still starting, `running_graph` raises the error.
     chosen = [run_directory] if run_directory is not None or not ready else ready
     results = await asyncio.gather(
         *(

@@ -13,6 +13,7 @@ import typer
 from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.graph import (
     NoGraphError,
+    choose_run,
     run_interruptible,
     run_node_here,
     running_graph,
@@ -160,7 +161,7 @@ def play(
             **options.LAUNCH_FILE,
         ),
     ] = None,
-    run: options.RunOption = None,
+    run: options.ChangedRunOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Publish the messages of a bag to a running graph, or to a graph that --launch starts.
@@ -170,7 +171,15 @@ def play(
 
     async def play_into(plan: ResolvedGraph, found: Run) -> int:
         return await _play(
-            bag, plan, found, topics=topics, rate=rate, start_s=start, loop=loop, as_json=as_json
+            bag,
+            plan,
+            found,
+            started=launch is not None,
+            topics=topics,
+            rate=rate,
+            start_s=start,
+            loop=loop,
+            as_json=as_json,
         )
 
     async def start_and_play(launch_file: Path) -> int:
@@ -187,7 +196,7 @@ def play(
     if launch is not None:
         raise typer.Exit(run_interruptible(start_and_play(launch)))
     try:
-        running = running_graph(run)
+        running = running_graph(choose_run(run))
     except NoGraphError as error:
         raise NoGraphError(
             f"{error}; or let this command start one: flexsheet bag play {bag} --launch replay"
@@ -576,6 +585,7 @@ async def _play(
     plan: ResolvedGraph,
     run: Run,
     *,
+    started: bool,
     topics: list[str] | None,
     rate: float,
     start_s: float,
@@ -584,6 +594,7 @@ async def _play(
 ) -> int:
     """Publish the messages of a bag to a running graph; always return 0, the exit code.
 
+    started: whether this command has started the graph.
     rate: playback speed relative to the recording.
     start_s: time in the bag at which playback starts.
     """
@@ -601,7 +612,8 @@ async def _play(
             f"flexsheet bag play {bag} --launch replay",
             FAILED,
         )
-    if any(plan.writers.get(name) for name in selection.left_out.keys() - NEVER_PLAYED.keys()):
+    refused = selection.left_out.keys() - NEVER_PLAYED.keys()
+    if not started and any(map(plan.writers.get, refused)):
         words.print(
             "to play topics that a node writes, use a launch file without this node that lists "
             "them under external_topics, such as --launch replay"

@@ -183,7 +183,7 @@ def explain(
     if not found:
         raise CommandError(
             f'"{message}": no error or note matches; {_suggestion(str(message))}'
-            "`flexsheet explain` lists all codes",
+            "`flexsheet explain` lists all codes, and `flexsheet logs NODE` prints a node's errors",
             FAILED,
         )
     rows = [{"code": one.code, "meaning": one.meaning, "remedy": one.remedy} for one in found]

@@ -100,6 +100,7 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
             ]
             for name in ("inputs", "outputs", "errors"):
                 del row[name]
+            row["note"] = row.pop("note")  # the longest column is the last one
         print_rows(rows, as_json=False)
         for line in explanations:
             words.print(line)

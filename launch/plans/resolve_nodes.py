@@ -26,6 +26,7 @@ from flexsheet.nodes.node import (
     Port,
     find_parameters_type,
     find_ports,
+    find_timers,
     find_unmatched_handlers,
     further_port,
 )
@@ -204,6 +205,15 @@ def _connect_ports(entry: NodeEntry, class_: type[Node], document: Document) -> 
             f'the method {name} of "{entry.spec.type}" handles no input',
             did_you_mean(name, handlers),
         )
+    parameters = list(find_parameters_type(class_).model_fields)
+    for timer in find_timers(class_):
+        if timer.rate_parameter not in parameters:
+            document.report(
+                (*entry.key, "type"),
+                f'the method {timer.method} of "{entry.spec.type}" is periodic with the rate '
+                f'"{timer.rate_parameter}", which is not a parameter of the node',
+                did_you_mean(timer.rate_parameter, parameters),
+            )
     for name in entry.spec.topics:
         if name not in ports:
             document.report(
