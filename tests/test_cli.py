@@ -746,9 +746,9 @@ def test_a_bag_plays_into_a_graph(
     flexsheet: Command, recorded: Path, runs_root: Path, tmp_path: Path
 ) -> None:
     launched = Launched(write(tmp_path, LISTENING), "--record", tmp_path / "b.mcap")
-    printed = flexsheet("bag", "play", recorded, "--rate", "4", "--topic", "twin/finger")
-    newest = runs.list_live_runs()[0]
-    refused = flexsheet("bag", "play", recorded, "--topic", "stereo", "--run", newest.directory)
+    into = ("--run", runs.list_live_runs()[0].directory)
+    printed = flexsheet("bag", "play", recorded, "--rate", "4", "--topic", "twin/finger", *into)
+    refused = flexsheet("bag", "play", recorded, "--topic", "stereo", *into)
     assert launched.stop() == 0
     assert printed.code == 0, printed.err
     assert (refused.code, "not in the bag" in refused.err) == (1, True)

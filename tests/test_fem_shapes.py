@@ -11,10 +11,16 @@ import trimesh
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from flexsheet.nodes.fem_solver.body import (
+    SceneBody,
+    build_scene_body,
+    find_front,
+    make_soft_body_spec,
+)
 from flexsheet.nodes.fem_solver.contact import Response
 from flexsheet.nodes.fem_solver.precompute import compute, estimate_budget
 from flexsheet.nodes.models import rigid
+from flexsheet.nodes.models.shapes import make_shape
 from tests.examples import long_except
 from tests.scenes import load_values
 
@@ -68,6 +74,15 @@ def soft(request: pytest.FixtureRequest) -> SceneBody:
     # said beforehand, and not far off
     assert 0.5 * len(table) < expected.loads < 4.0 * len(table)
     return build_scene_body(chosen, spec, model, linear_depth_m=0.006, max_depth_m=0.010)
+
+
+def test_the_front_of_a_tilted_plane_is_not_its_edge() -> None:
+    shape = make_shape({"shape": "plane", "width_m": 0.16, "height_m": 0.14})
+    rest = np.array([[x, y, z] for x in (-0.08, 0.08) for y in (-0.07, 0.07) for z in (-0.04, 0.0)])
+    tilt = np.radians(10.0)
+    front = find_front(shape, rest, np.array([0.0, -np.sin(tilt), np.cos(tilt)]))
+    # The line from the middle of the slab, 20 mm below the surface, to the user.
+    assert front == pytest.approx([0.0, -0.02 * np.tan(tilt), 0.0], abs=1e-5)
 
 
 def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Floats]:

@@ -46,6 +46,9 @@ finger of the demo and a skin spacing of 4.5 mm. The first row was measured on t
 by `python -m benchmarks.soft_body --table`. The second row is derived from the first row and was
 not measured.
 """
+TRACE_TOLERANCE_M, MAX_TRACE_STEPS = 1e-6, 100
+"""The distance from the surface at which `find_front` stops, and its maximum number of steps."""
+
 NOTED_DEPTHS_M = (0.001, 0.005)
 """The push depths (m) for which the node's status states the estimated force error."""
 
@@ -86,11 +89,11 @@ class SceneBody:
     """The soft body of a scene, at its pose in the world.
 
     method: method that computes the response. shape: surface of the body. spec: inputs of the
-    precomputation. skin: skin mesh. front (3,): surface point nearest to the user, m, mesh frame.
-    world_from_mesh (4, 4): pose of the mesh frame in the world. rest (s, 3): undeformed positions
-    of the s skin nodes, m, mesh frame. linear_depth_m: maximum depth of the linear method, at which
-    the stiffness is evaluated. friction_ratio: friction coefficient; 0 means that the finger slides
-    freely.
+    precomputation. skin: skin mesh. front (3,): surface point nearest to the user, m, mesh frame
+    (see `find_front`). world_from_mesh (4, 4): pose of the mesh frame in the world. rest (s, 3):
+    undeformed positions of the s skin nodes, m, mesh frame. linear_depth_m: maximum depth of the
+    linear method, at which the stiffness is evaluated. friction_ratio: friction coefficient; 0
+    means that the finger slides freely.
     """
 
     method: SoftBodyMethod
@@ -180,6 +183,29 @@ class SceneBody:
         )
 
 
+def find_front(shape: Shape, rest: Floats, towards_user: Floats) -> Floats:
+    """Return the surface point (3,) that is nearest to the user, m, mesh frame.
+
+    If this point is on the edge of the touchable surface, as for a tilted plane, the point between
+    the user and the middle of the object is returned instead. An object is not pushed at its edge.
+
+    rest (s, 3): positions of the skin nodes, m. towards_user (3,): unit vector.
+    """
+    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
+    point = middle + 2.0 * float(np.ptp(rest, axis=0).max()) * towards_user
+    found = shape.closest(point)
+    if not found.on_edge:
+        return found.point
+    for _ in range(MAX_TRACE_STEPS):
+        # No surface is nearer than the found point, so a step of this length cannot pass it.
+        step_m = float(np.linalg.norm(point - found.point))
+        if step_m < TRACE_TOLERANCE_M:
+            break
+        point = point - step_m * towards_user
+        found = shape.closest(point)
+    return found.point
+
+
 def build_scene_body(
     scene: Scene,
     spec: SoftBodySpec,
@@ -210,9 +236,6 @@ def build_scene_body(
         push_depth_m=scene.working_range.push_depth_m,
         drag=model.drag,
     )
-    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    away = 2.0 * float(np.ptp(rest, axis=0).max())
-    front = shape.closest(middle + away * np.array(spec.mesh.towards_user)).point
     pose_digest = hashlib.sha256(pose.tobytes()).hexdigest()[:8]
     skin = Skin(
         mesh_id=f"{spec.key()[:12]}-{pose_digest}",
@@ -223,7 +246,7 @@ def build_scene_body(
         method=method,
         spec=spec,
         shape=shape,
-        front=front,
+        front=find_front(shape, rest, np.array(spec.mesh.towards_user)),
         world_from_mesh=pose,
         rest=rest,
         skin=skin,
