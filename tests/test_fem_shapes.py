@@ -81,8 +81,7 @@ def test_the_front_of_a_tilted_plane_is_not_its_edge() -> None:
     rest = np.array([[x, y, z] for x in (-0.08, 0.08) for y in (-0.07, 0.07) for z in (-0.04, 0.0)])
     tilt = np.radians(10.0)
     front = find_front(shape, rest, np.array([0.0, -np.sin(tilt), np.cos(tilt)]))
-    # The line from the middle of the slab, 20 mm below the surface, to the user.
-    assert front == pytest.approx([0.0, -0.02 * np.tan(tilt), 0.0], abs=1e-5)
+    assert front == pytest.approx(np.zeros(3), abs=1e-5)
 
 
 def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Floats]:

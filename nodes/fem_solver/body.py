@@ -46,7 +46,10 @@ finger of the demo and a skin spacing of 4.5 mm. The first row was measured on t
 by `python -m benchmarks.soft_body --table`. The second row is derived from the first row and was
 not measured.
 """
-TRACE_TOLERANCE_M, MAX_TRACE_STEPS = 1e-6, 100
+FAR_M = 10.0
+"""The distance (m) of a distant user from an object."""
+
+TRACE_TOLERANCE_M, MAX_TRACE_STEPS = 1e-6, 200
 """The distance from the surface at which `find_front` stops, and its maximum number of steps."""
 
 NOTED_DEPTHS_M = (0.001, 0.005)
@@ -186,24 +189,22 @@ class SceneBody:
 def find_front(shape: Shape, rest: Floats, towards_user: Floats) -> Floats:
     """Return the surface point (3,) that is nearest to the user, m, mesh frame.
 
-    If this point is on the edge of the touchable surface, as for a tilted plane, the point between
-    the user and the middle of the object is returned instead. An object is not pushed at its edge.
+    For a distant user, this point can be on the edge of the touchable surface, as for a tilted
+    plane. The result is then the point that the user sees in the direction of the origin.
 
     rest (s, 3): positions of the skin nodes, m. towards_user (3,): unit vector.
     """
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    point = middle + 2.0 * float(np.ptp(rest, axis=0).max()) * towards_user
-    found = shape.closest(point)
-    if not found.on_edge:
-        return found.point
+    if not shape.closest(FAR_M * towards_user).on_edge:
+        return shape.closest(middle + 2.0 * np.ptp(rest, axis=0).max() * towards_user).point
+    point = FAR_M * towards_user
     for _ in range(MAX_TRACE_STEPS):
-        # No surface is nearer than the found point, so a step of this length cannot pass it.
-        step_m = float(np.linalg.norm(point - found.point))
+        # No surface is nearer than the nearest point, so a step of this length cannot pass it.
+        step_m = float(np.linalg.norm(point - shape.closest(point).point))
         if step_m < TRACE_TOLERANCE_M:
             break
         point = point - step_m * towards_user
-        found = shape.closest(point)
-    return found.point
+    return shape.closest(point).point
 
 
 def build_scene_body(
