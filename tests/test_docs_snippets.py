@@ -44,9 +44,9 @@ TUTORIALS = ("tutorial.md", "tutorial-record.md", "write-your-own-node.md")
 
 OURS = {"flexsheet", "make", "python", "pytest"}
 OTHERS = {
-    ".", "cd", "chmod", "chown", "cp", "dask", "docker", "docker/keys.sh", "git", "install",
-    "ip", "journalctl", "mkdir", "nano", "pip", "pip-compile", "python", "scp", "sleep", "ssh",
-    "sysctl", "systemctl", "systemd-analyze", "useradd", "^C",
+    ".", "cd", "chmod", "chown", "cp", "dask", "docker", "docker/keys.sh", "export", "git",
+    "install", "ip", "journalctl", "mkdir", "nano", "pip", "pip-compile", "python", "scp", "sleep",
+    "ssh", "sysctl", "systemctl", "systemd-analyze", "useradd", "^C",
 }  # fmt: skip
 """Other programs that pages may call."""
 

@@ -522,7 +522,8 @@ async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None
 async def test_addresses_beyond_loopback_are_rejected_without_keys(tmp_path: Path) -> None:
     hosts = {"main": {"address": "192.0.2.1"}}
     plan = load_graph(write(tmp_path, {"beacon": beacon()}, hosts=hosts))
-    with pytest.raises(BadInputError, match=r"graph.yaml:1: hosts.main.address: 192.0.2.1 is n"):
+    expected = r"graph\.yaml:1: hosts\.main\.address: connections to 192\.0\.2\.1 must be encrypted"
+    with pytest.raises(BadInputError, match=expected):
         await RunningGraph(plan).__aenter__()
 
 
