@@ -22,6 +22,7 @@ SHARED_MODULES = {
     "flexsheet.nodes.models",
     "flexsheet.nodes.node",
     "flexsheet.nodes.parameter_marks",
+    "flexsheet.nodes.worker_processes",
 }
 TWIN_MAY_SHARE = {"flexsheet.nodes.models.rigid", "flexsheet.nodes.models.shapes"}
 
