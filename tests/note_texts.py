@@ -134,11 +134,11 @@ def _render(part: ast.expr, functions: dict[str, ast.FunctionDef]) -> str:
             return _render(part.left, functions) + _render(part.right, functions)
         case ast.FormattedValue():
             return _render(part.value, functions)
+        case ast.Attribute(value=ast.Attribute(attr=member), attr="phrase"):
+            return NodeNote[member].phrase
         case ast.Attribute(attr="phrase"):
-            named = part.value
-            is_member = isinstance(named, ast.Attribute)
             # A variable of this type can name any note, so that each text with it has an entry.
-            return (NodeNote[named.attr] if is_member else NodeNote.COMPUTER_BUSY).phrase  # type: ignore[attr-defined]
+            return NodeNote.COMPUTER_BUSY.phrase
         case ast.Call(func=ast.Attribute(attr=name)) if name in functions:
             texts = (_render(one, functions) for one in _list_results(functions[name]))
             return max(texts, key=len, default=VALUE)

@@ -53,8 +53,7 @@ def load_or_compute_bounds(
 
     def compute() -> OffsetBoundsTable:
         progress(
-            "computing the stability bounds of the control loop with the user's hand (only once, "
-            "about 10 s)"
+            "computing the stability bounds of the control loop with the user's hand (only once)"
         )
         return compute_offset_bounds(1.0 / rate_hz, advance_limit=MAX_ADVANCE_PER_DEPTH)
 
