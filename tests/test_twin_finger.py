@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from flexsheet.launch.commands.explain import find_entries
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.clock import SystemClock, VirtualClock
+from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Lens, Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
@@ -390,24 +390,24 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
     assert node.note == 'follows the path "slow"'
 
 
-class SkippingClock(SystemClock):
-    """Real clock with jumps, as a stalled process would experience."""
+async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent, clock = Sent(), VirtualClock(10**9)
 
-    ahead_ns = 0
+    async def sleep_until(_: TwinFingerNode, at_ns: int) -> None:
+        clock.move_to(at_ns)
+        await asyncio.sleep(0)
 
-    def now_ns(self) -> int:
-        return super().now_ns() + self.ahead_ns
-
-
-async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(scene: Scene) -> None:
-    sent, clock = Sent(), SkippingClock()
+    monkeypatch.setattr(TwinFingerNode, "_sleep_until", sleep_until)
     node = TwinFingerNode(TwinFingerParameters(), name="finger", clock=clock, send=sent)
     await node.setup()
     try:
         await node.step("scene", scene, header())
         await sent.until("twin/stereo", 5)
-        assert not node.note, "no frame was missed"
-        clock.ahead_ns += 200_000_000
+        assert not node.missed_frames
+        assert not node.note
+        clock.move_to(clock.now_ns() + 200_000_000)
         frames = await sent.until("twin/stereo", 12)
         # The number increases before the note that states it.
         busy = "frames missed because the computer was busy"
