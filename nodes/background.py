@@ -3,18 +3,53 @@
 from __future__ import annotations
 
 import os
+import time
 from contextlib import suppress
+from pathlib import Path
 
 MAX_NICE = 19
+AUTOGROUP = Path("/proc/self/autogroup")
+"""The file that contains the niceness of this process's session.
+
+Linux distributes processor time among sessions, and each node has its own session. The niceness of
+a node's process alone therefore has little effect.
+"""
+
+AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
+"""The number of attempts to write AUTOGROUP, and the time (s) between two attempts.
+
+The kernel accepts only one write per 0.1 s from all unprivileged processes together.
+"""
+
 THREADS = "/proc/self/task"
 """The folder with the thread IDs of this process."""
+
+
+def set_session_niceness(niceness: int) -> None:
+    """Set the niceness of this process's session, if the kernel weights sessions.
+
+    Raises OSError if the system does not permit this niceness.
+    """
+    if not AUTOGROUP.exists():
+        return
+    for left in reversed(range(AUTOGROUP_TRIES)):
+        try:
+            AUTOGROUP.write_text(str(niceness))
+            return
+        except BlockingIOError:
+            if left == 0:
+                raise
+            time.sleep(AUTOGROUP_WAIT_S)
 
 
 def enter_background() -> None:
     """Give this process the lowest priority: the highest niceness, and batch scheduling.
 
-    A process with batch scheduling never interrupts a running process when it wakes up.
+    The process gets its own session, because the niceness of a process counts only within its
+    session. A process with batch scheduling never interrupts a running process when it wakes up.
     """
+    os.setsid()
+    set_session_niceness(MAX_NICE)
     os.setpriority(os.PRIO_PROCESS, 0, MAX_NICE)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
@@ -40,6 +75,14 @@ def leave_real_time(thread: int = 0) -> bool:
         return False
     os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
     return True
+
+
+def has_real_time(pid: int) -> bool:
+    """Return whether the main thread of a process has a real-time priority."""
+    try:
+        return os.sched_getscheduler(pid) == os.SCHED_RR
+    except ProcessLookupError:
+        return False
 
 
 def end_real_time(pid: int) -> bool:

@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
@@ -18,7 +18,8 @@ from flexsheet.nodes.background import enter_background
 def local_processes(count: int) -> Iterator[Executor]:
     """Yield an executor with `count` processes on this computer.
 
-    If the context exits with an exception, the processes stop and do not finish their jobs.
+    If the context exits with an exception, or if this process ends, the processes stop and do not
+    finish their jobs.
     """
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
@@ -35,15 +36,18 @@ def local_processes(count: int) -> Iterator[Executor]:
 def _init_worker(stop: Event) -> None:
     # Ctrl-C reaches all processes of a terminal, but the parent process stops its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    for name, wait in (("stop", stop.wait), ("parent", parent.join)):
+        threading.Thread(target=_exit_after, args=(wait,), name=name, daemon=True).start()
     enter_background()
-    threading.Thread(target=_exit_on, args=(stop,), name="stop", daemon=True).start()
 
 
-def _exit_on(stop: Event) -> None:
-    """Exit the worker process as soon as the event `stop` is set.
+def _exit_after(wait: Callable[[], object]) -> None:
+    """Exit the worker process as soon as the function `wait` returns.
 
     This is necessary because a job checks only after each push depth whether it must stop. One push
     depth can take a minute. The parent process stores finished results.
     """
-    stop.wait()
+    wait()
     os._exit(0)

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from threading import Event, Thread
 
+import psutil
 import pytest
 
 from flexsheet.launch.running import priority
-from flexsheet.nodes.background import MAX_NICE, enter_background, enter_real_time, leave_real_time
+from flexsheet.nodes.background import (
+    AUTOGROUP,
+    MAX_NICE,
+    enter_background,
+    enter_real_time,
+    leave_real_time,
+)
 from flexsheet.nodes.worker_processes import local_processes
 
 
@@ -41,6 +50,39 @@ def test_ctrl_c_does_not_interrupt_the_workers_of_a_soft_bodys_table() -> None:
 def test_workers_of_a_soft_bodys_table_are_background_processes() -> None:
     with local_processes(1) as workers:
         assert priority_in(workers) == (MAX_NICE, os.SCHED_BATCH)
+
+
+def session_niceness() -> tuple[bool, str]:
+    """Return whether this process has its own session, and the niceness of the session."""
+    return os.getsid(0) == os.getpid(), AUTOGROUP.read_text().split()[-1]
+
+
+@pytest.mark.skipif(not AUTOGROUP.exists(), reason="the kernel does not weight sessions")
+def test_a_worker_takes_no_processor_time_from_the_session_of_its_node() -> None:
+    with local_processes(1) as workers:
+        assert workers.submit(session_niceness).result() == (True, str(MAX_NICE))
+
+
+STARTS_WORKER = """
+import os, sys
+from flexsheet.nodes.worker_processes import local_processes
+with local_processes(1) as workers:
+    print(workers.submit(os.getpid).result(), flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_worker_ends_when_its_node_is_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", STARTS_WORKER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as node:
+        assert node.stdout is not None
+        worker = psutil.Process(int(node.stdout.readline()))
+        node.kill()
+    worker.wait(timeout=30)
 
 
 def policies_in_real_time() -> tuple[set[int], int, int]:

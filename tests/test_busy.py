@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flexsheet.launch.running.cpu import MAX_WAIT_RATIO, WINDOW_S, CpuWatch
+from flexsheet.launch.running.cpu import MAX_WAIT_RATIO, WINDOW_S, CpuMeter, CpuWatch
 from flexsheet.messages.busy import describe_busy, describe_busy_remedy, is_busy
 from flexsheet.messages.types import CpuPressure, HostStatus, ProgramCpu
 
@@ -102,6 +102,26 @@ def test_a_restarted_process_starts_from_zero(kernel: ProcFiles) -> None:
     assert found is not None
     assert found.node == "left"
     assert kernel.watch.update({"right": 99}) is None
+
+
+def test_a_process_that_has_just_started_does_not_count_as_starved(kernel: ProcFiles) -> None:
+    kernel.watch = CpuWatch(kernel.folder, lambda: kernel.now_s, min_s=1.5)
+    assert run(kernel, 2, left_s=0.95, right_s=0.0) is None
+    found = run(kernel, 1, left_s=0.95, right_s=0.0)
+    assert found is not None
+    assert (found.node, found.wait_ratio) == ("left", pytest.approx(0.95))
+
+
+def test_the_processor_time_of_a_group_is_measured(kernel: ProcFiles) -> None:
+    meter = CpuMeter(kernel.folder, lambda: kernel.now_s)
+    measured = []
+    for pids in ([11, 12], [11, 12], [11, 12, 13, 99]):
+        for pid, run_s in ((11, 0.5), (12, 1.0), (13, 3.0)):
+            kernel.let("python", pid, run_s=run_s)
+        kernel.now_s += 2.0
+        measured.append(meter.measure_cores(pids))
+    # Process 13 was not measured before, and process 99 does not exist.
+    assert measured == pytest.approx([0.0, 0.75, 0.75])
 
 
 def test_the_kernel_of_this_computer_has_the_counters() -> None:

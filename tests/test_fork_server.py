@@ -127,6 +127,7 @@ async def test_forked_process_reports_its_exit_code(tmp_path: Path) -> None:
             [config],
             environment={
                 **os.environ,
+                "OPENBLAS_NUM_THREADS": "1",
                 PARENT_VARIABLE: str(os.getpid()),
                 "FLEXSHEET_LIFELINE": str(read),
             },

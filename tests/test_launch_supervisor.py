@@ -28,7 +28,7 @@ from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import priority, runs, supervisor
-from flexsheet.launch.running.cpu import CpuWatch
+from flexsheet.launch.running.cpu import CpuMeter, CpuWatch
 from flexsheet.launch.running.priority import find_real_time_priority, min_nice_step
 from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
@@ -168,23 +168,49 @@ def test_a_port_used_by_a_running_graph_names_the_graph(runs_root: Path) -> None
     assert "--set" not in text
 
 
-async def test_real_time_is_withdrawn_if_another_node_gets_no_processor(
+async def test_real_time_is_withdrawn_step_by_step_while_a_node_gets_no_processor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    waiting = CpuPressure(busy=True, wait_ratio=0.5, node="listener", programs=())
-    found = [waiting]
-    monkeypatch.setattr(CpuWatch, "update", lambda *_, **__: found[-1])
-    lines: list[str] = []
-    plan = plan_of(tmp_path, beacon=beacon(realtime_priority=7), listener=LISTENER)
-    async with RunningGraph(plan, report=lambda _, line: lines.append(line)) as graph:
+    starved = CpuPressure(busy=True, wait_ratio=0.9, node="listener", programs=())
+    all_cores = float(os.cpu_count() or 1)
+    pressure, used_cores = starved.model_copy(update={"wait_ratio": 0.5}), all_cores
+    measured: list[tuple[CpuPressure, float]] = []
+
+    def measure(*_: Any) -> float:
+        measured.append((pressure, used_cores))
+        return used_cores
+
+    monkeypatch.setattr(CpuWatch, "update", lambda *_, **__: pressure)
+    monkeypatch.setattr(CpuMeter, "measure_cores", measure)
+    plan = plan_of(
+        tmp_path,
+        beacon=beacon(realtime_priority=7),
+        image=beacon(realtime_priority=3, topics={"twin__finger": None}),
+        listener=LISTENER,
+    )
+    policies: list[tuple[str, int]] = []
+
+    def report(_: str, line: str) -> None:
+        if "continue without real-time priority" in line:
+            policies.append((line, os.sched_getscheduler(graph.pids["beacon"])))
+
+    async with RunningGraph(plan, report=report) as graph:
         await graph.wait_ready()
-        pid = graph.pids["beacon"]
-        granted = os.sched_getscheduler(pid)
-        found.append(waiting.model_copy(update={"wait_ratio": 0.9}))
+        pids = graph.pids["beacon"], graph.pids["image"]
+        granted = os.sched_getscheduler(pids[0])
+        await until(lambda: len(measured) > 1, "two measurements")
+        pressure, used_cores, before = starved, 0.1, len(measured)
+        await until(lambda: len(measured) > before + 1, "two measurements")
+        assert not policies, "the node waits for other programs"
+        assert os.sched_getscheduler(pids[0]) == granted
+        used_cores = all_cores
         if granted == os.SCHED_RR:
-            text = "beacon continue without real-time priority"
-            await until(lambda: any(text in line for line in lines), "the report")
-        assert os.sched_getscheduler(pid) == os.SCHED_OTHER
+            await until(lambda: len(policies) == 2, "two reports")
+            (first, policy), (second, _) = policies
+            assert "so image continue" in first
+            assert policy == os.SCHED_RR, "the higher priority is withdrawn later"
+            assert "so beacon continue" in second
+        assert {os.sched_getscheduler(pid) for pid in pids} == {os.SCHED_OTHER}
 
 
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:

@@ -15,6 +15,7 @@ from flexsheet.launch.running.priority import (
     find_real_time_priority,
     min_nice_step,
 )
+from flexsheet.nodes import background
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = load_graph(ROOT / "launch" / "demo.yaml")
@@ -73,7 +74,8 @@ def test_a_missing_permission_for_priority_is_reported_once(
 def test_a_missing_permission_for_real_time_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     allow(monkeypatch, capable=True, limit=0)
     monkeypatch.setattr(priority, "_may_set_real_time", lambda wanted: False)
-    problem = describe_priority_problem(list(DEMO.nodes.values()))
+    nodes = load_graph(ROOT / "launch" / "lab.yaml").nodes
+    problem = describe_priority_problem(list(nodes.values()))
     assert problem is not None
     assert "arm_left_bridge" in problem
     assert "renderer" not in problem
@@ -120,19 +122,22 @@ def test_a_session_of_a_nice_launcher_is_nice(
 ) -> None:
     autogroup = tmp_path / "autogroup"
     autogroup.touch()
-    monkeypatch.setattr(child, "AUTOGROUP", autogroup)
+    monkeypatch.setattr(background, "AUTOGROUP", autogroup)
     monkeypatch.setattr(os, "nice", lambda step: launcher + step)
     monkeypatch.setenv(child.NICE_VARIABLE, str(nice))
     child.apply_niceness()
     assert autogroup.read_text() == written
 
 
-def test_what_the_arms_wait_for_goes_before_all_else_in_the_demo() -> None:
+def test_in_the_demo_the_arms_come_first_and_the_image_before_other_programs() -> None:
     chain = {
         "twin_finger", "camera", "triangulator", "planner", "twin_arms", "arm_left_bridge",
         "arm_right_bridge",
     }  # fmt: skip
-    assert {name for name, node in DEMO.nodes.items() if node.realtime_priority} == chain
+    priorities = {name: node.realtime_priority for name, node in DEMO.nodes.items()}
+    assert {name for name, given in priorities.items() if given == 10} == chain
+    assert {name for name, given in priorities.items() if given == 5} == {"fem_solver", "renderer"}
+    assert set(priorities.values()) <= {None, 5, 10}
     first = max(DEMO.nodes[name].nice for name in chain)
     assert first < 0 <= min(node.nice for node in DEMO.nodes.values() if node.name not in chain)
 

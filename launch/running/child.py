@@ -8,7 +8,8 @@ import signal
 import sys
 import threading
 import time
-from pathlib import Path
+
+from flexsheet.nodes.background import set_session_niceness
 
 PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
@@ -19,19 +20,6 @@ exits.
 """
 
 NICE_VARIABLE = "FLEXSHEET_NICE"
-
-AUTOGROUP = Path("/proc/self/autogroup")
-"""The file that contains the niceness of this process's session.
-
-Linux distributes processor time among sessions, and each node has its own session. The niceness of
-a node's process alone therefore has little effect.
-"""
-
-AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
-"""The number of attempts to write AUTOGROUP, and the time (s) between two attempts.
-
-The kernel accepts only one write per 0.1 s from all unprivileged processes together.
-"""
 
 GRACE_S = 3.0
 _PR_SET_PDEATHSIG = 1
@@ -73,13 +61,5 @@ def apply_niceness() -> None:
     total = os.nice(nice)
     # A user may lack the permission to give a negative niceness of the launcher to a session.
     session_nice = total if total > 0 or nice < 0 else nice
-    if session_nice == 0 or not AUTOGROUP.exists():
-        return
-    for left in reversed(range(AUTOGROUP_TRIES)):
-        try:
-            AUTOGROUP.write_text(str(session_nice))
-            return
-        except BlockingIOError:
-            if left == 0:
-                raise
-            time.sleep(AUTOGROUP_WAIT_S)
+    if session_nice:
+        set_session_niceness(session_nice)

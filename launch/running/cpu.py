@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,10 +49,17 @@ class CpuWatch:
 
     proc: folder of the kernel's counters.
     now_s: function that returns the time (s) of the monotonic clock.
+    min_s: time (s) for which a process must be watched before its waiting time is known.
     """
 
-    def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._proc, self._now_s = proc, now_s
+    def __init__(
+        self,
+        proc: Path = PROC,
+        now_s: Callable[[], float] = time.monotonic,
+        *,
+        min_s: float = 0.0,
+    ) -> None:
+        self._proc, self._now_s, self._min_s = proc, now_s, min_s
         self._history: deque[Waits] = deque()
         self._cpu_before: tuple[float, dict[tuple[str, int], float]] | None = None
 
@@ -83,7 +90,9 @@ class CpuWatch:
         ratios = {
             name: min(1.0, (waited_s[pid] - before.waited_s[pid]) / (now_s - before.time_s))
             for name, pid in watched.items()
-            if pid in waited_s and (before := self._first_with(pid)) and before.time_s < now_s
+            if pid in waited_s
+            and (before := self._first_with(pid))
+            and now_s - before.time_s > self._min_s
         }
         self._history.append(Waits(now_s, waited_s))
         node = max(ratios, key=lambda name: ratios[name], default="")
@@ -131,12 +140,50 @@ class CpuWatch:
         for folder in self._proc.iterdir():
             if not folder.name.isdigit():
                 continue
-            try:
-                text = (folder / "stat").read_text(errors="replace")
-            except OSError:
-                continue  # the process has ended
-            # The name in brackets can itself contain brackets, so it is split at the last one. User
-            # and system time are fields 14 and 15.
-            head, _, tail = text.rpartition(")")
-            user, system = tail.split()[11:13]
-            yield head.partition("(")[2], int(folder.name), (int(user) + int(system)) / _TICKS_PER_S
+            found = _read_cpu_time(folder)
+            if found is not None:
+                yield found[0], int(folder.name), found[1]
+
+
+class CpuMeter:
+    """A meter of the processor time that a group of processes uses.
+
+    proc: folder of the kernel's counters.
+    now_s: function that returns the time (s) of the monotonic clock.
+    """
+
+    def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._proc, self._now_s = proc, now_s
+        self._before: tuple[float, dict[int, float]] | None = None
+
+    def measure_cores(self, pids: Iterable[int]) -> float:
+        """Return the number of cores that the processes have used since the last call.
+
+        A process that was not measured in the last call counts as 0.
+        """
+        now_s = self._now_s()
+        found = {pid: _read_cpu_time(self._proc / str(pid)) for pid in set(pids)}
+        used_s = {pid: one[1] for pid, one in found.items() if one is not None}
+        before, self._before = self._before, (now_s, used_s)
+        if before is None or before[0] >= now_s:
+            return 0.0
+        spent_s = sum(used_s[pid] - before[1][pid] for pid in used_s.keys() & before[1].keys())
+        return spent_s / (now_s - before[0])
+
+
+def _read_cpu_time(folder: Path) -> tuple[str, float] | None:
+    """Return the program name and the total processor time (s) of a process.
+
+    Returns None if the process has ended.
+
+    folder: folder of the process in /proc.
+    """
+    try:
+        text = (folder / "stat").read_text(errors="replace")
+    except OSError:
+        return None
+    # The name in brackets can itself contain brackets, so it is split at the last one. User and
+    # system time are fields 14 and 15.
+    head, _, tail = text.rpartition(")")
+    user, system = tail.split()[11:13]
+    return head.partition("(")[2], (int(user) + int(system)) / _TICKS_PER_S

@@ -21,7 +21,7 @@ import zmq
 
 from flexsheet.launch.plans.hosts import clock_node, launcher_on
 from flexsheet.launch.plans.plan_model import ArmingMode, ResolvedGraph, ResolvedNode, tools_on
-from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
+from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuMeter, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
 from flexsheet.launch.running.priority import list_denied
 from flexsheet.launch.running.runs import Run, local_endpoints, local_sources
@@ -42,7 +42,7 @@ from flexsheet.messages.types import (
     NodeProcess,
 )
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.background import end_real_time
+from flexsheet.nodes.background import end_real_time, has_real_time
 from flexsheet.nodes.node import Output, PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
 
@@ -50,6 +50,15 @@ PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 STARVED_WAIT_RATIO = 0.8
 """The minimum fraction of time without a processor at which real-time priorities are withdrawn."""
+
+STARVED_FOR_S = 1.5
+"""The minimum time (s) for which a node is watched before real-time priorities are withdrawn."""
+
+MAX_REAL_TIME_FRACTION = 0.85
+"""The maximum fraction of all cores that real-time nodes can use while another node waits.
+
+If they use less, the other node waits for programs without real-time priority.
+"""
 
 REASON_LENGTH = 1000
 """The maximum length (characters) of an e-stop's reason, so that it fits into every message."""
@@ -86,7 +95,8 @@ class HostAgent:
     ) -> None:
         self._plan, self._host, self._run, self._code = plan, host, run, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
-        self._pids, self._cpu, self._starvation = pids, CpuWatch(), CpuWatch()
+        self._pids, self._cpu, self._starvation = pids, CpuWatch(), CpuWatch(min_s=STARVED_FOR_S)
+        self._real_time_cpu = CpuMeter()
         self._busy_statuses, self._busy_reported_ns = 0, 0
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
@@ -120,7 +130,9 @@ class HostAgent:
         self._devices, self._folder = list_device_files(nodes), find_recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
         self._nice_denied = bool(list_denied(nodes))
-        self._real_time = {node.name for node in nodes if node.realtime_priority is not None}
+        self._real_time = {
+            node.name: node.realtime_priority for node in nodes if node.realtime_priority
+        }
 
     def start(self) -> None:
         """Subscribe to e-stops and start to publish. An event loop must be running."""
@@ -312,22 +324,32 @@ class HostAgent:
             self._on_problem(f"{describe_busy(status)}; {remedy}")
 
     def _limit_real_time(self) -> None:
-        """Withdraw the real-time priorities of this graph's nodes if they starve another node.
+        """Withdraw the lowest real-time priority of this graph's nodes if they starve another node.
 
-        All running nodes are checked, including those of low priority (high niceness).
+        If the node still waits afterwards, a later call withdraws the next priority. All running
+        nodes are checked, including those of low priority (high niceness).
         """
         pids = self._pids()
+        configured = {pids[name] for name in self._real_time.keys() & pids.keys()}
+        cores = self._real_time_cpu.measure_cores(filter(has_real_time, configured))
         ready = {one.name for one in self._processes() if one.state == "ready"}
         pressure = self._starvation.update({name: pids[name] for name in ready & pids.keys()})
         if pressure is None or pressure.wait_ratio < STARVED_WAIT_RATIO:
             return
-        changed = [name for name in self._real_time & pids.keys() if end_real_time(pids[name])]
-        if changed:
-            self._on_problem(
-                f"{pressure.node} waited for a processor {pressure.wait_ratio:.0%} of the time, so "
-                f"{', '.join(sorted(changed))} continue without real-time priority; run fewer "
-                "programs on this computer"
-            )
+        if cores < MAX_REAL_TIME_FRACTION * len(os.sched_getaffinity(0)):
+            return
+        for level in sorted(set(self._real_time.values())):
+            names = [name for name in pids if self._real_time.get(name) == level]
+            ended = {pid for pid in {pids[name] for name in names} if end_real_time(pid)}
+            changed = [name for name in names if pids[name] in ended]
+            if changed:
+                self._starvation = CpuWatch(min_s=STARVED_FOR_S)
+                self._on_problem(
+                    f"{pressure.node} waited for a processor {pressure.wait_ratio:.0%} of the "
+                    f"time, so {', '.join(sorted(changed))} continue without real-time priority; "
+                    "run fewer programs on this computer"
+                )
+                return
 
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
