@@ -80,3 +80,12 @@ def test_a_requested_image_has_the_priority_of_a_frame() -> None:
     """With a lower priority, the first eye view took 90 s on two busy cores."""
     nodes = load_graph(ROOT / "launch" / "demo.yaml", console=True).nodes
     assert nodes["twin_eye"].nice <= nodes["renderer"].nice
+
+
+def test_beside_a_console_the_image_leaves_processor_time_for_the_browser() -> None:
+    """With a real-time priority of the image, the page drew one frame in three seconds."""
+    for console in (False, True):
+        nodes = load_graph(ROOT / "launch" / "demo.yaml", console=console).nodes
+        image = {nodes[name].realtime_priority for name in ("renderer", "fem_solver")}
+        assert image == ({None} if console else {5})
+        assert nodes["planner"].realtime_priority == 10
