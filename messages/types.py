@@ -774,10 +774,10 @@ class FingerPath(Message):
     times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
     positions_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))]
     wander_m: NonNegative = Field(
-        description="standard deviation of slow random position errors of the hand, m"
+        default=0.0, description="standard deviation of slow random position errors of the hand, m"
     )
     tremor_m: NonNegative = Field(
-        description="amplitude of the simulated hand tremor from 8 to 12 Hz, m"
+        default=0.0, description="amplitude of the simulated hand tremor from 8 to 12 Hz, m"
     )
     joined_by: PathJoin = Field(
         default="rounded_lines",

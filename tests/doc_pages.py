@@ -79,8 +79,8 @@ def as_built(page: Path) -> Path:
 
 
 def site_pages() -> list[Path]:
-    """Return the pages of the site."""
-    return sorted(DOCS.rglob("*.md"))
+    """Return the pages of the site, without the page that `make charts` writes."""
+    return sorted(page for page in DOCS.rglob("*.md") if page.parent != DOCS / "charts")
 
 
 def pages() -> list[Path]:

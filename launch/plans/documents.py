@@ -83,6 +83,26 @@ MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapp
 NUMBER_ERROR_TYPES = ("float_parsing", "float_type", "int_parsing", "int_type")
 """The types of pydantic errors for values that should be numbers."""
 
+REMEDIES = {
+    "greater_than": "write a value greater than {gt:g}",
+    "greater_than_equal": "write a value of at least {ge:g}",
+    "less_than": "write a value less than {lt:g}",
+    "less_than_equal": "write a value of at most {le:g}",
+    "finite_number": "write a finite number",
+    "int_from_float": "write an integer",
+    "literal_error": "write {expected}",
+    "enum": "write {expected}",
+    "string_type": "write a text",
+    "bool_type": "write true or false",
+    "bool_parsing": "write true or false",
+    "list_type": "write a list",
+    "tuple_type": "write a list",
+    "path_type": "write the path of a file",
+    "too_short": "write at least {min_length} values",
+    "too_long": "write at most {max_length} values",
+}
+"""The remedy for each type of pydantic error; names in braces are keys of the error's context."""
+
 Key = tuple[str | int, ...]
 """The path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
 
@@ -484,7 +504,10 @@ def describe_value_error(error: Any, name: str) -> tuple[str, str]:
         unit = find_unit(name)
         is_plain = unit in ("", "1")
         return what, "write a number" if is_plain else f"write a number in {unit}, without the unit"
-    raised = error.get("ctx", {}).get("error")
+    context = error.get("ctx", {})
+    if error["type"] in REMEDIES:
+        return what, REMEDIES[error["type"]].format(**context)
+    raised = context.get("error")
     return what, str(raised) if isinstance(raised, Exception) else error["msg"]
 
 
