@@ -22,6 +22,9 @@ from flexsheet.messages.units import find_unit
 MAX_LENGTH_M = 10.0
 """The maximum length or coordinate (m), which is about the size of a room."""
 
+MAX_SIZE_M = 2.0
+"""The maximum size (m) of the virtual object or of a device. A larger size is often meant in mm."""
+
 MAX_ANGLE_RAD = 7.0
 """The maximum angle (rad): a full rotation plus a margin for rounding."""
 
@@ -56,6 +59,12 @@ MAX_SEED = 2.0**63
 MAX_BYTES = 2.0**50
 
 MAX_BY_NAME = {
+    "radius_m": MAX_SIZE_M,
+    "length_m": MAX_SIZE_M,
+    "width_m": MAX_SIZE_M,
+    "height_m": MAX_SIZE_M,
+    "size_m": MAX_SIZE_M,
+    "semi_axes_m": MAX_SIZE_M,
     "max_tool_speed_m_per_s": MAX_TOOL_SPEED_M_PER_S,
     "max_stretch_ratio": MAX_STRETCH_RATIO,
     "min_stretch_ratio": MAX_STRETCH_RATIO,

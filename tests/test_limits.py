@@ -131,6 +131,8 @@ def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], va
     ("key", "value", "printed"),
     [
         (("object", "geometry", "radius_m"), 1e300, "object.geometry.radius_m"),
+        (("object", "geometry", "radius_m"), 4.0, "4.0 is invalid; give at most 2 m"),
+        (("object", "geometry", "radius_m"), -0.1, "give a value greater than 0 m"),
         (("projector", "width_px"), 2_000_000_000, "projector.width_px"),
         (("arms", "max_tool_speed_m_per_s"), 1e9, "arms.max_tool_speed_m_per_s"),
         (("camera", "right_from_left", 3, 3), 0.0, "the last row"),
@@ -179,7 +181,8 @@ def test_what_files_hold_is_limited() -> None:
 
 
 def test_units_have_their_limits() -> None:
-    assert find_max_magnitude("radius_m") == 10.0
+    assert find_max_magnitude("position_m") == 10.0
+    assert find_max_magnitude("radius_m") == 2.0
     assert find_max_magnitude("speed_m_per_s") == 10.0
     assert find_max_magnitude("max_tool_speed_m_per_s") == 2.2
     assert find_max_magnitude("mark_max_area_px") > find_max_magnitude("width_px")

@@ -83,11 +83,16 @@ MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapp
 NUMBER_ERROR_TYPES = ("float_parsing", "float_type", "int_parsing", "int_type")
 """The types of pydantic errors for values that should be numbers."""
 
+LIMIT_REMEDIES = {
+    "greater_than": "give a value greater than {gt:g}",
+    "greater_than_equal": "give a value of at least {ge:g}",
+    "less_than": "give a value less than {lt:g}",
+    "less_than_equal": "give a value of at most {le:g}",
+}
+"""The remedy for each type of pydantic error about a limit, to which the unit is appended; names in
+braces are keys of the error's context."""
+
 REMEDIES = {
-    "greater_than": "write a value greater than {gt:g}",
-    "greater_than_equal": "write a value of at least {ge:g}",
-    "less_than": "write a value less than {lt:g}",
-    "less_than_equal": "write a value of at most {le:g}",
     "finite_number": "write a finite number",
     "int_from_float": "write an integer",
     "literal_error": "write {expected}",
@@ -98,10 +103,10 @@ REMEDIES = {
     "list_type": "write a list",
     "tuple_type": "write a list",
     "path_type": "write the path of a file",
-    "too_short": "write at least {min_length} values",
-    "too_long": "write at most {max_length} values",
+    "too_short": "give at least {min_length} values",
+    "too_long": "give at most {max_length} values",
 }
-"""The remedy for each type of pydantic error; names in braces are keys of the error's context."""
+"""The remedy for each other type of pydantic error."""
 
 Key = tuple[str | int, ...]
 """The path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
@@ -500,11 +505,12 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 def describe_value_error(error: Any, name: str) -> tuple[str, str]:
     """Describe a pydantic error of the value `name`, and return the text and the remedy."""
     what = f"{_shorten(error['input'])} is invalid"
+    unit = find_unit(name) if find_unit(name) != "1" else ""
     if error["type"] in NUMBER_ERROR_TYPES:
-        unit = find_unit(name)
-        is_plain = unit in ("", "1")
-        return what, "write a number" if is_plain else f"write a number in {unit}, without the unit"
+        return what, f"write a number in {unit}, without the unit" if unit else "write a number"
     context = error.get("ctx", {})
+    if error["type"] in LIMIT_REMEDIES:
+        return what, f"{LIMIT_REMEDIES[error['type']].format(**context)} {unit}".rstrip()
     if error["type"] in REMEDIES:
         return what, REMEDIES[error["type"]].format(**context)
     raised = context.get("error")
