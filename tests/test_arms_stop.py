@@ -309,6 +309,10 @@ def test_without_an_answer_the_senders_of_targets_are_killed(runs_root: Path, pr
         for name in (process, "camera")
     }
     try:
+        for one in started.values():
+            # The kernel sets the arguments a moment after the start.
+            arguments = Path(f"/proc/{one.pid}/cmdline")
+            wait_until(arguments.read_bytes, "the arguments of the process")
         attempts = stop_arms([runs_root], REASON)
         assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
             (StopPath.SIGNAL, "planner", StopOutcome.KILLED)
