@@ -171,9 +171,8 @@ def _check_number(value: float, name: str) -> None:
         hint = ""
         if name.endswith("_rad") and abs(value) <= MAX_ANGLE_DEG:
             hint = f"; {value:g}° are {math.radians(value):.4g} rad"
-        raise ValueError(
-            f"give at most {find_max_magnitude(name):g}{unit}, and a finite number{hint}"
-        )
+        finite = "" if math.isfinite(value) else ", and a finite number"
+        raise ValueError(f"give at most {find_max_magnitude(name):g}{unit}{finite}{hint}")
 
 
 def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
