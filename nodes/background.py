@@ -48,10 +48,12 @@ def enter_background() -> None:
     The process gets its own session, because the niceness of a process counts only within its
     session. A process with batch scheduling never interrupts a running process when it wakes up.
     """
-    os.setsid()
-    set_session_niceness(MAX_NICE)
     os.setpriority(os.PRIO_PROCESS, 0, MAX_NICE)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.setsid()
+    # If many processes start at once, the kernel refuses some writes. The work itself can continue.
+    with suppress(OSError):
+        set_session_niceness(MAX_NICE)
 
 
 def enter_real_time(priority: int) -> None:

@@ -8,12 +8,14 @@ import subprocess
 import sys
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 from threading import Event, Thread
 
 import psutil
 import pytest
 
 from flexsheet.launch.running import priority
+from flexsheet.nodes import background
 from flexsheet.nodes.background import (
     AUTOGROUP,
     MAX_NICE,
@@ -61,6 +63,19 @@ def session_niceness() -> tuple[bool, str]:
 def test_a_worker_takes_no_processor_time_from_the_session_of_its_node() -> None:
     with local_processes(1) as workers:
         assert workers.submit(session_niceness).result() == (True, str(MAX_NICE))
+
+
+def enter_background_without_permission() -> tuple[int, int]:
+    """Enter the background in a process that may not set the niceness of its session."""
+    background.AUTOGROUP = Path("/proc/version")  # exists, and cannot be written
+    enter_background()
+    return os.getpriority(os.PRIO_PROCESS, 0), os.sched_getscheduler(0)
+
+
+def test_a_worker_runs_if_the_niceness_of_its_session_cannot_be_set() -> None:
+    with ProcessPoolExecutor(1, get_context("fork")) as process:
+        found = process.submit(enter_background_without_permission).result()
+    assert found == (MAX_NICE, os.SCHED_BATCH)
 
 
 STARTS_WORKER = """
