@@ -39,20 +39,24 @@ def set_session_niceness(niceness: int) -> None:
         except BlockingIOError:
             if left == 0:
                 raise
+            # No event announces when the kernel accepts the next write.
             time.sleep(AUTOGROUP_WAIT_S)
 
 
 def enter_background() -> None:
     """Give this process the lowest priority: the highest niceness, and batch scheduling.
 
-    The process gets its own session, because the niceness of a process counts only within its
-    session. A process with batch scheduling never interrupts a running process when it wakes up.
+    The process gets its own session, because Linux first divides processor time among sessions
+    (if autogroups are enabled). If the kernel does not accept the niceness of the session, the
+    process has its own niceness only. A process with batch scheduling never interrupts a running
+    process when it wakes up.
     """
     os.setpriority(os.PRIO_PROCESS, 0, MAX_NICE)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     os.setsid()
-    # If many processes start at once, the kernel refuses some writes. The work itself can continue.
-    with suppress(OSError):
+    # If many processes start at once, the kernel refuses some writes; some containers refuse all.
+    # The work itself can continue.
+    with suppress(BlockingIOError, PermissionError):
         set_session_niceness(MAX_NICE)
 
 
@@ -79,12 +83,18 @@ def leave_real_time(thread: int = 0) -> bool:
     return True
 
 
-def has_real_time(pid: int) -> bool:
-    """Return whether the main thread of a process has a real-time priority."""
-    try:
-        return os.sched_getscheduler(pid) == os.SCHED_RR
-    except ProcessLookupError:
-        return False
+def list_real_time_threads(pid: int) -> list[int]:
+    """Return the ids of the threads of a process that have real-time priority.
+
+    The list is empty if the process has ended.
+    """
+    found = []
+    with suppress(FileNotFoundError, ProcessLookupError):
+        for thread in map(int, os.listdir(f"/proc/{pid}/task")):
+            with suppress(ProcessLookupError):
+                if os.sched_getscheduler(thread) == os.SCHED_RR:
+                    found.append(thread)
+    return found
 
 
 def end_real_time(pid: int) -> bool:
@@ -92,9 +102,8 @@ def end_real_time(pid: int) -> bool:
 
     Returns whether a thread had real-time priority; False if the process has ended.
     """
-    found = False
-    with suppress(FileNotFoundError):
-        for thread in os.listdir(f"/proc/{pid}/task"):
-            with suppress(ProcessLookupError):
-                found |= leave_real_time(int(thread))
-    return found
+    threads = list_real_time_threads(pid)
+    for thread in threads:
+        with suppress(ProcessLookupError):
+            leave_real_time(thread)
+    return bool(threads)

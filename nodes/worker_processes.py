@@ -34,7 +34,7 @@ def local_processes(count: int) -> Iterator[Executor]:
 
 
 def _init_worker(stop: Event) -> None:
-    # Ctrl-C reaches all processes of a terminal, but the parent process stops its workers itself.
+    # Until the process has its own session, Ctrl-C reaches it, but its parent stops it itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 from threading import Event, Thread
 
 import psutil
@@ -65,17 +64,39 @@ def test_a_worker_takes_no_processor_time_from_the_session_of_its_node() -> None
         assert workers.submit(session_niceness).result() == (True, str(MAX_NICE))
 
 
-def enter_background_without_permission() -> tuple[int, int]:
-    """Enter the background in a process that may not set the niceness of its session."""
-    background.AUTOGROUP = Path("/proc/version")  # exists, and cannot be written
+class RefusingAutogroup:
+    """A file of the kernel that refuses each write."""
+
+    def __init__(self, error: OSError) -> None:
+        self.error = error
+
+    def exists(self) -> bool:
+        return True
+
+    def write_text(self, _: str) -> int:
+        raise self.error
+
+
+def enter_background_beside(error: OSError) -> tuple[int, int]:
+    """Enter the background while the kernel refuses the niceness of the session."""
+    background.AUTOGROUP = RefusingAutogroup(error)  # type: ignore[assignment]
+    background.AUTOGROUP_WAIT_S = 0.0
     enter_background()
     return os.getpriority(os.PRIO_PROCESS, 0), os.sched_getscheduler(0)
 
 
-def test_a_worker_runs_if_the_niceness_of_its_session_cannot_be_set() -> None:
+@pytest.mark.parametrize("error", [BlockingIOError(), PermissionError()], ids=["busy", "refused"])
+def test_a_worker_runs_if_the_niceness_of_its_session_cannot_be_set(error: OSError) -> None:
     with ProcessPoolExecutor(1, get_context("fork")) as process:
-        found = process.submit(enter_background_without_permission).result()
+        found = process.submit(enter_background_beside, error).result()
     assert found == (MAX_NICE, os.SCHED_BATCH)
+
+
+def test_another_error_of_the_kernel_is_reported() -> None:
+    with ProcessPoolExecutor(1, get_context("fork")) as process:
+        broken = process.submit(enter_background_beside, OSError("input/output error"))
+        with pytest.raises(OSError, match="input/output"):
+            broken.result()
 
 
 STARTS_WORKER = """

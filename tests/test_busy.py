@@ -30,11 +30,14 @@ class ProcFiles:
         self._waited_s[pid] = self._waited_s.get(pid, 0.0) + wait_s
         self._used_s[pid] = self._used_s.get(pid, 0.0) + run_s
         folder = self.folder / str(pid)
-        folder.mkdir(exist_ok=True)
+        thread = folder / "task" / str(pid)
+        thread.mkdir(parents=True, exist_ok=True)
         run_ns, wait_ns = round(1e9 * self._used_s[pid]), round(1e9 * self._waited_s[pid])
         (folder / "schedstat").write_text(f"{run_ns} {wait_ns} 7\n")
         ticks = round(self._used_s[pid] * TICKS_PER_S)
-        (folder / "stat").write_text(f"{pid} ({name}) S {'0 ' * 10}{ticks} 0 0 0 20 0 1 0 5\n")
+        stat = f"{pid} ({name}) S {'0 ' * 10}{ticks} 0 0 0 20 0 1 0 5\n"
+        (folder / "stat").write_text(stat)
+        (thread / "stat").write_text(stat)
 
 
 @pytest.fixture
@@ -112,15 +115,15 @@ def test_a_process_that_has_just_started_does_not_count_as_starved(kernel: ProcF
     assert (found.node, found.wait_ratio) == ("left", pytest.approx(0.95))
 
 
-def test_the_processor_time_of_a_group_is_measured(kernel: ProcFiles) -> None:
+def test_the_processor_time_of_threads_is_measured(kernel: ProcFiles) -> None:
     meter = CpuMeter(kernel.folder, lambda: kernel.now_s)
     measured = []
     for pids in ([11, 12], [11, 12], [11, 12, 13, 99]):
         for pid, run_s in ((11, 0.5), (12, 1.0), (13, 3.0)):
             kernel.let("python", pid, run_s=run_s)
         kernel.now_s += 2.0
-        measured.append(meter.measure_cores(pids))
-    # Process 13 was not measured before, and process 99 does not exist.
+        measured.append(meter.measure_cores({pid: [pid] for pid in pids}))
+    # Thread 13 was not measured before, and process 99 does not exist.
     assert measured == pytest.approx([0.0, 0.75, 0.75])
 
 

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from flexsheet.launch import cli
 from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.explain import find_entries
 from flexsheet.launch.commands.man import list_commands
 from flexsheet.launch.commands.options import FORMER_NAMES
 from flexsheet.launch.commands.output import (
@@ -51,6 +52,14 @@ def parse(line: str) -> str:
         words.append(name)
         context = command.make_context(name, rest, parent=context)
     return " ".join(words[1:])
+
+
+def test_the_texts_in_the_examples_of_explain_are_explained() -> None:
+    lines = map(shlex.split, examples_in(COMMANDS["explain"].epilog))
+    quoted = [words[2] for words in lines if len(words) > 2]
+    assert any(" " in text for text in quoted)
+    for text in quoted:
+        assert find_entries(text), text
 
 
 def test_the_command_line_is_this() -> None:

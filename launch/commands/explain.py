@@ -165,7 +165,7 @@ def _suggestion(text: str) -> str:
         "flexsheet explain",
         "flexsheet explain bag",
         "flexsheet explain saturated --json",
-        "flexsheet explain 'topic arm_left: host left rejects the key of this host'",
+        "flexsheet explain 'host left rejects the key of this host; check its launch file'",
     )
 )
 def explain(

@@ -103,8 +103,8 @@ REMEDIES = {
     "list_type": "write a list",
     "tuple_type": "write a list",
     "path_type": "write the path of a file",
-    "too_short": "give at least {min_length} values",
-    "too_long": "give at most {max_length} values",
+    "too_short": "give {min_length} or more values",
+    "too_long": "give {max_length} or fewer values",
 }
 """The remedy for each other type of pydantic error."""
 

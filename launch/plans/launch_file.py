@@ -289,17 +289,11 @@ def apply_record(document: Document, bag: Path) -> None:
 
 
 def apply_console(document: Document) -> None:
-    """Add a console and a recorder that starts paused, as the option --console does.
-
-    Nodes with positive niceness get no real-time priority, so that the browser can draw the page.
-    """
+    """Add a console and a recorder that starts paused, as the option --console does."""
     origin = "--console"
     nodes = document.values.get("nodes")
     specs = [one for one in nodes.values() if isinstance(one, dict)] if nodes else []
     roles = {_find_role(spec.get("type")) for spec in specs}
-    for name, spec in nodes.items() if isinstance(nodes, dict) else ():
-        if isinstance(spec, dict) and _has_positive_niceness(spec) and "realtime_priority" in spec:
-            document.set(("nodes", name, "realtime_priority"), None, origin)
     if NodeRole.CONSOLE not in roles:
         added: dict[str, Any] = {"type": "console", "nice": CONSOLE_NICE}
         if NodeRole.FINGER_SIMULATOR not in roles:
@@ -309,11 +303,6 @@ def apply_console(document: Document) -> None:
         parameters = {"bag": str(RECORDINGS.absolute()), "start_paused": True}
         recorder = {"type": "recorder", "nice": RECORDER_NICE, "parameters": parameters}
         document.set(("nodes", "recorder"), recorder, origin)
-
-
-def _has_positive_niceness(spec: dict[str, Any]) -> bool:
-    nice = spec.get("nice")
-    return isinstance(nice, int) and nice > 0
 
 
 def _find_role(type_name: object) -> NodeRole | None:

@@ -44,8 +44,8 @@ class Waits:
 class CpuWatch:
     """A monitor that measures how long processes wait for a processor core.
 
-    Waiting times are measured over the last WINDOW_S seconds. The monitor also finds the programs
-    that use the cores. Call `update` once a second.
+    Waiting times are measured over the last WINDOW_S seconds, or since the last call if that is
+    longer ago. The monitor also finds the programs that use the cores. Call `update` once a second.
 
     proc: folder of the kernel's counters.
     now_s: function that returns the time (s) of the monotonic clock.
@@ -84,7 +84,8 @@ class CpuWatch:
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
         waited_s = {pid: waited for pid, waited in counted.items() if waited is not None}
-        while self._history and self._history[0].time_s < now_s - WINDOW_S:
+        # A caller that is itself delayed may call less often than once in the window.
+        while len(self._history) > 1 and self._history[1].time_s <= now_s - WINDOW_S:
             self._history.popleft()
         # The kernel counts a wait when it ends, including its part before the window.
         ratios = {
@@ -146,7 +147,7 @@ class CpuWatch:
 
 
 class CpuMeter:
-    """A meter of the processor time that a group of processes uses.
+    """A meter of the processor time that a group of threads uses.
 
     proc: folder of the kernel's counters.
     now_s: function that returns the time (s) of the monotonic clock.
@@ -156,27 +157,33 @@ class CpuMeter:
         self._proc, self._now_s = proc, now_s
         self._before: tuple[float, dict[int, float]] | None = None
 
-    def measure_cores(self, pids: Iterable[int]) -> float:
-        """Return the number of cores that the processes have used since the last call.
+    def measure_cores(self, threads: Mapping[int, Iterable[int]]) -> float:
+        """Return the number of cores that the threads have used since the last call.
 
-        A process that was not measured in the last call counts as 0.
+        A thread that was not measured in the last call counts as 0.
+
+        threads: ids of the threads, by process id.
         """
         now_s = self._now_s()
-        found = {pid: _read_cpu_time(self._proc / str(pid)) for pid in set(pids)}
-        used_s = {pid: one[1] for pid, one in found.items() if one is not None}
+        found = {
+            thread: _read_cpu_time(self._proc / str(pid) / "task" / str(thread))
+            for pid, ids in threads.items()
+            for thread in ids
+        }
+        used_s = {thread: one[1] for thread, one in found.items() if one is not None}
         before, self._before = self._before, (now_s, used_s)
         if before is None or before[0] >= now_s:
             return 0.0
-        spent_s = sum(used_s[pid] - before[1][pid] for pid in used_s.keys() & before[1].keys())
-        return spent_s / (now_s - before[0])
+        common = used_s.keys() & before[1].keys()
+        return sum(used_s[one] - before[1][one] for one in common) / (now_s - before[0])
 
 
 def _read_cpu_time(folder: Path) -> tuple[str, float] | None:
-    """Return the program name and the total processor time (s) of a process.
+    """Return the name and the total processor time (s) of a process or thread.
 
-    Returns None if the process has ended.
+    Returns None if it has ended.
 
-    folder: folder of the process in /proc.
+    folder: folder of the process or thread in /proc.
     """
     try:
         text = (folder / "stat").read_text(errors="replace")

@@ -42,7 +42,7 @@ from flexsheet.messages.types import (
     NodeProcess,
 )
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.background import end_real_time, has_real_time
+from flexsheet.nodes.background import end_real_time, list_real_time_threads
 from flexsheet.nodes.node import Output, PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
 
@@ -327,13 +327,15 @@ class HostAgent:
         """Withdraw the lowest real-time priority of this graph's nodes if they starve another node.
 
         If the node still waits afterwards, a later call withdraws the next priority. All running
-        nodes are checked, including those of low priority (high niceness).
+        nodes without real-time priority are checked, including those of high niceness.
         """
         pids = self._pids()
-        configured = {pids[name] for name in self._real_time.keys() & pids.keys()}
-        cores = self._real_time_cpu.measure_cores(filter(has_real_time, configured))
+        threads = {pid: list_real_time_threads(pid) for pid in set(pids.values())}
+        cores = self._real_time_cpu.measure_cores(threads)
         ready = {one.name for one in self._processes() if one.state == "ready"}
-        pressure = self._starvation.update({name: pids[name] for name in ready & pids.keys()})
+        pressure = self._starvation.update(
+            {name: pids[name] for name in ready & pids.keys() if not threads[pids[name]]}
+        )
         if pressure is None or pressure.wait_ratio < STARVED_WAIT_RATIO:
             return
         if cores < MAX_REAL_TIME_FRACTION * len(os.sched_getaffinity(0)):
@@ -345,9 +347,10 @@ class HostAgent:
             if changed:
                 self._starvation = CpuWatch(min_s=STARVED_FOR_S)
                 self._on_problem(
-                    f"{pressure.node} waited for a processor {pressure.wait_ratio:.0%} of the "
-                    f"time, so {', '.join(sorted(changed))} continue without real-time priority; "
-                    "run fewer programs on this computer"
+                    f"{pressure.node} waited for a processor {pressure.wait_ratio:.0%} of the time "
+                    f"while nodes with real-time priority used {cores:.1f} cores; now without "
+                    f"real-time priority: {', '.join(sorted(changed))}; lower their rates, or run "
+                    "fewer nodes on this computer"
                 )
                 return
 

@@ -164,9 +164,10 @@ class Child:
         return self._process.pid
 
     def signal(self, number: int) -> None:
-        """Send a signal to the process and to all processes that it started.
+        """Send a signal to the process and to the other processes of its group.
 
-        If the process has exited, nothing is sent.
+        If the process has exited, nothing is sent. Worker processes have their own groups, and end
+        when this process ends.
         """
         if not self.exited.done():
             # The process is not reaped yet, so its id cannot belong to another process.
