@@ -49,8 +49,8 @@ MAX_TOOL_SPEED_M_PER_S = 2.2
 The value is from the specification of the RV-1A, for motion of all joints together.
 """
 
-MAX_STRETCH_RATIO = 10.0
-"""The maximum stretch ratio of a sheet. Natural rubber breaks at a smaller ratio."""
+MAX_STRETCH_RATIO = 3.0
+"""The maximum stretch ratio of a sheet. Scenes use ratios below 1.2."""
 
 MAX_NUMBER = 1e9
 """The maximum magnitude of a number that has no unit."""
@@ -171,6 +171,8 @@ def _check_number(value: float, name: str) -> None:
         hint = ""
         if name.endswith("_rad") and abs(value) <= MAX_ANGLE_DEG:
             hint = f"; {value:g}° are {math.radians(value):.4g} rad"
+        elif unit == " m" and abs(value) <= 1e3 * find_max_magnitude(name):
+            hint = f"; {value:g} mm are {1e-3 * value:g} m"
         finite = "" if math.isfinite(value) else ", and a finite number"
         raise ValueError(f"give at most {find_max_magnitude(name):g}{unit}{finite}{hint}")
 

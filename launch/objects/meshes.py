@@ -31,6 +31,7 @@ from flexsheet.nodes.models.shapes.triangles import (
     unify_winding,
     volume_m3,
 )
+from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
@@ -96,7 +97,23 @@ def make_scene(document: Document) -> Scene:
         document.values["object"]["geometry"] = dict(mesh)
     load_image(document)
     load_arm_models(document)
-    return validate(Scene, document)
+    scene = validate(Scene, document)
+    _check_edge_force(scene, document)
+    return scene
+
+
+def _check_edge_force(scene: Scene, document: Document) -> None:
+    """Raise BadInputError if the sheet exceeds its edge force already at its minimum stretch."""
+    sheet = scene.sheet
+    force_n = edge_force_n(sheet.min_stretch_ratio, sheet)
+    if force_n > sheet.max_edge_force_n:
+        what = (
+            f"{sheet.min_stretch_ratio:g} needs {force_n:.4g} N on each clamped edge, more than "
+            f"max_edge_force_n, {sheet.max_edge_force_n:g} N"
+        )
+        raise document.error(
+            ("sheet", "min_stretch_ratio"), what, "check young_modulus_pa, or give a smaller ratio"
+        )
 
 
 def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> Mesh:
