@@ -56,11 +56,11 @@ def compliance(
     from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.messages.sheet_calibration import load_sheet_calibration
     from flexsheet.nodes.planner.compliance import ObjectCurve
-    from flexsheet.nodes.planner.sheet_force import make_force_model
+    from flexsheet.nodes.planner.force_table import choose_force_model
 
     scene = load_scene(scene_file)
-    law = make_force_model(
-        scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
+    law, _ = choose_force_model(
+        scene, None if calibration is None else load_sheet_calibration(calibration)
     )
     with progress_words() as progress:
         reporters = {stage: report_time_left(stage, progress) for stage in ForceCurveStage}

@@ -39,9 +39,9 @@ from flexsheet.nodes.planner.compliance import (
     fit_compliance,
     make_stretch_limits,
 )
+from flexsheet.nodes.planner.force_table import choose_force_model
 from flexsheet.nodes.planner.hand_bounds import bounds_cache, load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.planner.sheet_force import make_force_model
 
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
@@ -226,8 +226,11 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     if method != "linear" and best.method.name == "linear":
         return None
     calibration = given.sheet_calibration
-    law = make_force_model(
-        scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
+    law, _ = choose_force_model(
+        scene,
+        None if calibration is None else load_sheet_calibration(calibration),
+        given.sheet_force,
+        given.cache_dir,
     )
     fixed_s = given.prediction_horizon_s
     delay_s = FINGERTIP_AGE_S + given.actuation_delay_s if fixed_s is None else fixed_s

@@ -22,6 +22,9 @@ Progress = Callable[[str], None]
 REPORT_STEP_RATIO = 0.1
 """The progress between two reports, as a fraction of the total work."""
 
+REPORT_STEP_S = 20.0
+"""The time (s) after which a report follows even if the progress is smaller."""
+
 
 class NoSoftBodyError(FlexsheetError, RuntimeError):
     """Raised if the soft body (FEM model) of a scene cannot be computed."""
@@ -76,24 +79,24 @@ def precompute_deflection_shapes(
 def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
     """Return a function (done, total) that reports the progress and the remaining time.
 
-    The function reports in steps of 10 % of the total work. If `total` changes, or `done`
-    decreases, the reports start again.
+    The function reports in steps of 10 % of the total work, or after 20 s. If `total` changes, or
+    `done` decreases, the reports start again.
 
     what: name of the computation in the reports.
     """
     from flexsheet.nodes.cache import EtaEstimator
 
-    eta, next_ratio, last = EtaEstimator(), 0.0, (0, 0)
+    eta, next_ratio, last, next_s = EtaEstimator(), 0.0, (0, 0), 0.0
 
     def on_progress(done: int, total: int) -> None:
-        nonlocal next_ratio, last
+        nonlocal next_ratio, last, next_s
         if done < last[0] or total != last[1]:
             next_ratio = 0.0
-        last = done, total
-        progress_text = eta.text(done, total, time.monotonic())
-        if done >= next_ratio * total:
+        last, now_s = (done, total), time.monotonic()
+        progress_text = eta.text(done, total, now_s)
+        if done >= next_ratio * total or now_s >= next_s:
             progress(f"{what}: {progress_text}")
-            next_ratio = done / total + REPORT_STEP_RATIO
+            next_ratio, next_s = done / total + REPORT_STEP_RATIO, now_s + REPORT_STEP_S
 
     return on_progress
 

@@ -11,14 +11,15 @@ from __future__ import annotations
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.methods import SheetForceMethod
+from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.nodes.cache import Specification, advise_precompute, cached, load_cached
 from flexsheet.nodes.methods import Progress
 from flexsheet.nodes.models.sheet.force_models import (
@@ -26,7 +27,11 @@ from flexsheet.nodes.models.sheet.force_models import (
     SheetForceModel,
 )
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
-from flexsheet.nodes.planner.sheet_force import compute_membrane_table, make_rubber
+from flexsheet.nodes.planner.sheet_force import (
+    compute_membrane_table,
+    make_force_model,
+    make_rubber,
+)
 
 VERSION = 1
 """The version of the computation. A cached table of another version is computed again."""
@@ -90,6 +95,23 @@ def compute_table(
         finger_radius_m=scene.finger.radius_m,
         progress=progress,
     )
+
+
+def choose_force_model(
+    scene: Scene,
+    calibration: SheetCalibration | None,
+    method: SheetForceMethod | Literal["auto"] = "auto",
+    cache_dir: Path | None = None,
+) -> tuple[SheetForceModel, str]:
+    """Return the force model that the planner uses for a scene, and a note for the operator.
+
+    calibration: calibration of the sheet, which replaces the method; None: not calibrated.
+    method: "auto" stands for the method of the scene.
+    """
+    if calibration is not None:
+        return make_force_model(scene.sheet, calibration), "calibrated"
+    chosen: SheetForceMethod = resolve_method(method, scene.methods.sheet_force, "scaled")
+    return load_force_model(scene, chosen, cache_dir)
 
 
 def load_force_model(

@@ -8,7 +8,6 @@ import numpy as np
 import scipy
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
@@ -23,7 +22,7 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
-from flexsheet.nodes.planner.force_table import load_force_model
+from flexsheet.nodes.planner.force_table import choose_force_model
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.self_checks import (
@@ -31,7 +30,6 @@ from flexsheet.nodes.planner.self_checks import (
     PlannedPush,
     check_stiffness,
 )
-from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import (
     ActuationDelayEstimator,
     MonotonicTimestampFilter,
@@ -103,13 +101,9 @@ class Planner(Node):
         # If the new object cannot be presented, the last object's plan must not stay in use.
         self._trajectory = self._compliance = None
         self._trajectory = SheetTrajectoryPlanner(scene, self.parameters)
-        if self._calibration is None:
-            method: SheetForceMethod = resolve_method(
-                self.parameters.sheet_force, scene.methods.sheet_force, "scaled"
-            )
-            model, self._model_text = load_force_model(scene, method, self.parameters.cache_dir)
-        else:
-            model, self._model_text = make_force_model(scene.sheet, self._calibration), "calibrated"
+        model, self._model_text = choose_force_model(
+            scene, self._calibration, self.parameters.sheet_force, self.parameters.cache_dir
+        )
         measured = None if self._calibration is None else self._calibration.hysteresis_ratio
         mode = self.parameters.choose_compliance(scene)
         bounds = None
