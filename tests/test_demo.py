@@ -14,6 +14,7 @@ from flexsheet.launch.experiments import (
     ExperimentError,
     OverloadedError,
     demo,
+    image,
     run,
     stroke,
 )
@@ -111,11 +112,15 @@ def test_the_demo_ends_with_the_files_and_what_they_show(
         file: Path, given: object, bag: Path, progress: Any, report: demo.Report, **_: object
     ) -> None:
         report(demo.DemoResult(figures=[demo.DemoFigure(bag.parent / "latency.png", "delays")]))
-        report(demo.DemoResult(figures=[demo.DemoFigure(bag.parent / "eye.png", "images")]))
+        sizes = {"sheet": "tilted", "correction": "two_pass", "mean_mm": 0.125, "max_mm": 4.25}
+        report(
+            demo.DemoResult([], None, [sizes], [demo.DemoFigure(bag.parent / "eye.png", "images")])
+        )
 
     monkeypatch.setattr(demo, "run_demo", run_short)
-    code, _, err = flexsheet("demo", "--output", tmp_path)
+    code, out, err = flexsheet("demo", "--output", tmp_path)
     assert code == 0
+    assert all(text in out for text in ("two_pass", "0.12", "4.25"))
     assert err.splitlines()[-5:] == [
         f"files to look at, in {tmp_path}:",
         "  eye.png: images",
@@ -123,6 +128,29 @@ def test_the_demo_ends_with_the_files_and_what_they_show(
         "  demo.mcap: recording of all topics",
         f"all figures and faults of the recording: flexsheet bag report {tmp_path}/demo.mcap",
     ]
+
+
+def test_the_demo_reports_the_sizes_that_the_eye_sees(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    white = np.zeros((400, 400, 3), np.uint8)
+    white[150:250, 100:300] = 255
+    wider = np.zeros_like(white)
+    wider[150:250, 95:305] = 255
+    pictures = {
+        label: image.EyeImage(label, correction, 0.001, wider, white)
+        for series, value, corrections in demo.IMAGES
+        for correction in corrections
+        for label in [series.label(value, correction)]
+    }
+    monkeypatch.setattr(image, "read_images", lambda bag: pictures)
+    result = demo.evaluate_images(tmp_path / "demo.mcap", 2)
+    assert result is not None
+    assert [one["correction"] for one in result.images] == list(demo.IMAGES[1][2])
+    assert {one["sheet"] for one in result.images} == {"pushed 30 mm"}
+    assert result.images[0]["mean_mm"] == pytest.approx(5.0, abs=0.1)
+    assert result.images[0]["max_mm"] == pytest.approx(10.0, abs=0.1)
+    assert [one.path.exists() for one in result.figures] == [True]
 
 
 def test_an_error_names_the_bag_and_the_command_that_evaluates_it(

@@ -15,7 +15,13 @@ from flexsheet.launch.commands.experiment import (
     print_followed,
     print_strokes,
 )
-from flexsheet.launch.commands.output import examples, print_json, progress_words, words
+from flexsheet.launch.commands.output import (
+    examples,
+    print_columns,
+    print_json,
+    progress_words,
+    words,
+)
 from flexsheet.messages.errors import FlexsheetError
 
 if TYPE_CHECKING:
@@ -60,6 +66,7 @@ def demo(
     def report(new: DemoResult) -> None:
         results.strokes += new.strokes
         results.followed = new.followed or results.followed
+        results.images += new.images
         figures = [one for one in new.figures if one not in results.figures]
         results.figures += figures
         if not as_json:
@@ -83,6 +90,16 @@ def _print_result(result: DemoResult) -> None:
         print_strokes(result.strokes)
     if result.followed is not None:
         print_followed([result.followed])
+    if result.images:
+        print_columns(
+            result.images,
+            {
+                "sheet": ("sheet", ""),
+                "image correction": ("correction", ""),
+                "mean error of sizes, mm": ("mean_mm", ".2f"),
+                "largest, mm": ("max_mm", ".2f"),
+            },
+        )
     sys.stdout.flush()
     for figure in result.figures:
         words.print(f"image: {figure.path}")
@@ -103,6 +120,7 @@ def _print_results(result: DemoResult, bag: Path) -> None:
         {
             "strokes": result.strokes,
             "followed": result.followed,
+            "images": result.images,
             "bag": str(bag),
             "figures": [str(figure.path) for figure in result.figures],
         }

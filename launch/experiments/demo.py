@@ -70,10 +70,12 @@ class DemoResult:
 
     strokes: one result per stroke of the finger.
     followed: errors of the sheet along the given finger path; None if no path was given.
+    images: errors (mm) of the sizes that the eye sees, for each sheet and image correction.
     """
 
     strokes: list[dict[str, Any]] = field(default_factory=list)
     followed: dict[str, Any] | None = None
+    images: list[dict[str, Any]] = field(default_factory=list)
     figures: list[DemoFigure] = field(default_factory=list)
 
 
@@ -187,7 +189,8 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
 def evaluate_images(bag: Path, count: int) -> DemoResult | None:
     """Draw the images of the simulated eye for the first `count` entries of IMAGES.
 
-    Return None if the bag does not yet contain the images of all these entries.
+    The result contains the errors of the last of these entries. Return None if the bag does not yet
+    contain the images of all these entries.
     """
     images, rows = image.read_images(bag), []
     for series, value, corrections in IMAGES[:count]:
@@ -197,4 +200,18 @@ def evaluate_images(bag: Path, count: int) -> DemoResult | None:
         rows.append((f"sheet {series.name.format(value)}", [images[label] for label in labels]))
     views = bag.parent / "eye.png"
     draw_eye_views(rows, views)
-    return DemoResult(figures=[DemoFigure(views, EYE_FIGURE)])
+    series, value, corrections = IMAGES[count - 1]
+    errors = [
+        {
+            "sheet": series.name.format(value),
+            "correction": correction,
+            **_summarize_sizes(images[series.label(value, correction)], series),
+        }
+        for correction in corrections
+    ]
+    return DemoResult(images=errors, figures=[DemoFigure(views, EYE_FIGURE)])
+
+
+def _summarize_sizes(seen: image.EyeImage, series: image.Series) -> dict[str, float]:
+    errors_mm = image.size_errors_mm(seen, series.sizes)
+    return {"mean_mm": sum(errors_mm) / len(errors_mm), "max_mm": max(errors_mm)}
