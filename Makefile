@@ -1,4 +1,5 @@
 # Two commands from a fresh clone: `make demo` and `make test`.  Both set up what they need.
+.DEFAULT_GOAL := help
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin

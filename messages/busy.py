@@ -12,8 +12,8 @@ This limit is used on computers that cannot measure how long processes wait for 
 """
 
 BUSY_REMEDY = (
-    "the arms may pause meanwhile; end other programs, give the graph more cores, or start fewer "
-    "nodes"
+    "end other programs, give the graph more cores, or start fewer nodes; until then, the arms may "
+    "pause"
 )
 
 

@@ -73,7 +73,7 @@ _extension = tuple.__new__
 
 
 class WireError(FlexsheetError, ValueError):
-    """Raised if a message is invalid or unexpected, or if it cannot be encoded.
+    """Raised if a message is invalid or unexpected or cannot be encoded.
 
     cause: "malformed", "type", "fingerprint", "frames", "size" or "field". A subscriber also uses
         "writer", "plan", "replayed" and "forbidden".

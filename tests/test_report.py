@@ -322,7 +322,7 @@ def test_errors_are_listed_with_the_worst_first(numbers: dict[str, Any]) -> None
         "planner had 3 errors; the last: on_fingertip: bang.",
         "fingertip: 1 messages were refused",
         "fingertip stopped once",
-        "outside its valid range in 10.0 % of the results",
+        "In 10.0 % of the results, the finger was deeper than the range",
     ):
         assert part in printed, part
     gravities = [one.gravity for one in found]

@@ -33,7 +33,7 @@ REPORT_FILE, APPARATUS_FILE, CROSSES_FILE = "report.md", "apparatus.yaml", "co-l
 
 
 class CommissionError(FlexsheetError, ValueError):
-    """Raised if the commissioning in a folder cannot be continued, or if data are invalid."""
+    """Raised if the commissioning in a folder cannot be continued or its data are invalid."""
 
     code = "commission"
     remedy = "Correct the option that the error names, or use a new folder."

@@ -45,8 +45,6 @@ MAX_TOPICS_LISTED = 10
 
 app = options.make_app("Record, play and analyse bags, which are MCAP files of recorded topics.")
 
-FormerOutput = Annotated[Path | None, typer.Argument(help="Same as --output.", hidden=True)]
-
 
 @app.command(
     epilog=examples(
@@ -237,14 +235,13 @@ def info(bag: options.BagArgument, as_json: options.JsonOption = False) -> None:
 @app.command(epilog=examples("flexsheet bag recover cut.mcap -o whole.mcap"))
 def recover(
     bag: options.BagArgument,
-    target: FormerOutput = None,
     output: Annotated[Path | None, options.output_file("Recovered bag to write.", "BAG")] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Copy the readable messages of a truncated or damaged bag to a new bag."""
     from flexsheet.messages.bag import recover as recover_bag
 
-    output = _require_output(output or target)
+    output = _require_output(output)
     with progress_bar(f"recovering {bag.name}") as progress:
         report = recover_bag(bag, output, progress=progress)
     print_result({**asdict(report), "output": str(output)}, as_json=as_json)
@@ -260,7 +257,6 @@ def recover(
 def export(
     *,
     bag: options.BagArgument,
-    target: FormerOutput = None,
     output: Annotated[
         Path | None,
         options.output_file("MCAP file, or folder of a ROS 2 bag (--format ros2), to write."),
@@ -273,7 +269,7 @@ def export(
     as_json: options.JsonOption = False,
 ) -> None:
     """Convert a bag to an MCAP file for the viewers Foxglove and Rerun, or for ROS 2."""
-    output = _require_output(output or target)
+    output = _require_output(output)
     if form == "ros2":
         from flexsheet.launch.bags.export_ros2 import export_ros2 as export_bag
     else:

@@ -28,7 +28,10 @@ PROGRESS_LINE_S = 2.0
 
 
 class CommandError(FlexsheetError):
-    """Raised to end a command with an error text and an exit code."""
+    """Raised if a command cannot do what the user requests.
+
+    It ends the command with an error text and an exit code.
+    """
 
     code = "command"
     remedy = "Correct the option or file that the error names."

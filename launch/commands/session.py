@@ -194,8 +194,9 @@ def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if superseded:
         lines.append(
             f"skipped: {', '.join(superseded)}. A newer message replaced each before the node read "
-            "it, and the node needs only the newest. This is normal. If a number grows in each "
-            "call, the node is too slow: `flexsheet doctor`, row `load`, shows why."
+            "it, and the node needs only the newest. This is normal: a node with a lower rate than "
+            "a topic always skips some. If sheet or image are late, `flexsheet doctor`, row "
+            "`load`, shows whether the computer is too slow."
         )
     if overflowed:
         lines.append(

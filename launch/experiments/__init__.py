@@ -16,7 +16,7 @@ Entry = TypeVar("Entry")
 
 
 class ExperimentError(FlexsheetError, RuntimeError):
-    """Raised if an experiment fails, or if a bag does not contain the data of the experiment."""
+    """Raised if an experiment fails or a bag does not contain the data of the experiment."""
 
     code = "experiment"
     remedy = (

@@ -89,7 +89,7 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
     if not file.suffix and not file.exists():
         raise ExperimentError(
             f'"{name_or_file}" is neither a gesture nor a file; '
-            f"{did_you_mean(name_or_file, list(GESTURES))} Or name a CSV file of a recorded finger"
+            f"{did_you_mean(name_or_file, list(GESTURES))} A recorded finger is given as a CSV file"
         )
     try:
         return recorded_path(file, scene)

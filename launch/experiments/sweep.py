@@ -40,7 +40,10 @@ MAX_ERROR_CHARACTERS = 600
 
 
 class TrialError(ExperimentError):
-    """Raised in the parent process if the process of a trial ended without a result."""
+    """Raised if the process of a trial has ended without a result.
+
+    It is raised in the parent process.
+    """
 
     code = "trial"
     remedy = "Run the same experiment alone; the text names what failed."

@@ -134,7 +134,10 @@ class Problem:
 
 
 class BadInputError(FlexsheetError, ValueError):
-    """Raised if an input cannot be used; the attribute `problems` lists all errors."""
+    """Raised if an input cannot be used.
+
+    The attribute `problems` lists all errors.
+    """
 
     code = "bad-input"
     exit_code = 2

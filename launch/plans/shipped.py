@@ -26,6 +26,10 @@ def find_file(given: str | Path, shipped: Path, folder: Path = Path()) -> Path:
     return named if not (path.exists() or path.suffix) and named.is_file() else path
 
 
+SIMILAR = 0.75
+"""The minimum similarity (0 to 1) of a wrong name and a shipped name that is suggested."""
+
+
 def name_shipped(given: str | Path, shipped: Path) -> str:
     """Return the remedy for an error about a missing file, with the names of the shipped files.
 
@@ -33,7 +37,7 @@ def name_shipped(given: str | Path, shipped: Path) -> str:
     shipped: folder of the shipped files, which is LAUNCH_FILES or SCENES.
     """
     names = list_shipped(shipped)
-    near = get_close_matches(Path(given).stem, names, n=1)
+    near = get_close_matches(Path(given).stem, names, n=1, cutoff=SIMILAR)
     remedy = f'did you mean "{near[0]}"? Shipped' if near else "check the path, or name a shipped"
     kind = "scene" if shipped == SCENES else "launch file"
     return f"{remedy} {kind}{'s' if near else ''}: {', '.join(names)}"

@@ -246,8 +246,9 @@ def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     if body["out_of_range"]:
         ratio = body["out_of_range"] / sum(body["methods"].values())
         text = (
-            "The soft body's method was outside its valid range in "
-            f"{format_percent(ratio)} of the results."
+            f"In {format_percent(ratio)} of the results, the finger was deeper than the range of "
+            "the soft body's method, or past the part that can be touched. Its force and shape are "
+            "approximate there; push less deeply if they matter."
         )
         yield SessionFinding("doubtful", text, "nodes")
 
