@@ -426,8 +426,9 @@ def test_a_speed_that_is_too_high_gives_a_warning_and_the_largest_speed(
     assert calm.followed.all()
     assert calm.remedies == ()
     monkeypatch.setattr(layout, "check_layout", lambda scene, **_: found)
-    code, out, _ = flexsheet("doctor", "scene", SCENE_FILE)
+    code, out, err = flexsheet("doctor", "scene", SCENE_FILE)
     assert code == 0
+    assert f"flexsheet doctor compliance {SCENE_FILE}" in err
     assert re.search(r"^warning: the arms follow \d+ mm/s at only [\d.]+ % of", out, re.M)
     assert f"remedy: {remedy.what}" in out
 

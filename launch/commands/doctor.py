@@ -122,6 +122,11 @@ def check_scene(
         print_json(result)
     else:
         _print_layout(result, scene.working_range.speed_m_per_s)
+        if scene.object.material is not None:
+            words.print(
+                "whether the sheet can be as stiff as the object is a separate check: flexsheet "
+                f"doctor compliance {scene_file}"
+            )
     if not layout.reachable:
         raise typer.Exit(FAILED)
 
