@@ -109,8 +109,27 @@ def evaluate_table(scene: Scene, spacing_m: float, *, cold: bool) -> dict[str, A
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])
         sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
         report["pushes"] += evaluate_push(scene, mesh, sample, best, linear)
+    report["worst_by_depth"] = find_worst(report["pushes"])
     report["slides"] = [evaluate_slides(scene, best, radius_m, depth_m) for depth_m in DEPTHS_M]
+    report["max_step_p99_us"] = max(one["step_p99_us"] for one in report["slides"])
     return report
+
+
+def find_worst(pushes: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
+    """Return the table's largest skin error at each depth, and its largest force error up to it."""
+    of_table = [one for one in pushes if one["method"] == "table"]
+    return [
+        {
+            "depth_mm": depth_mm,
+            "skin_error_mm": max(
+                one["skin_error_mm"] for one in of_table if one["depth_mm"] == depth_mm
+            ),
+            "force_error_to_here_percent": max(
+                abs(one["force_error_percent"]) for one in of_table if one["depth_mm"] <= depth_mm
+            ),
+        }
+        for depth_mm in sorted({one["depth_mm"] for one in of_table})
+    ]
 
 
 def load_bodies(
@@ -328,7 +347,9 @@ def main() -> None:
     scene = load_scene(SCENE_FILE)
     if options.table:
         report = evaluate_table(scene, options.spacing, cold=options.cold)
-        print_report(report, "force_errors", "pushes", "slides", as_json=options.json)
+        print_report(
+            report, "force_errors", "pushes", "worst_by_depth", "slides", as_json=options.json
+        )
         return
     meshes = [measure(scene, spacing_m) for spacing_m in SPACINGS_M]
     slides = [row for mesh in meshes for row in mesh.pop("slides")]
