@@ -108,7 +108,7 @@ FACTORS = {
     "stiffness": Factor(
         "Pa", (1e3, 4e3, 16e3, 64e3, 256e3), ("object", "material", "young_modulus_pa")
     ),
-    "stretch": Factor("ratio", (1.02, 1.05, 1.08, 1.12, 1.2), ("sheet", "max_stretch_ratio")),
+    "stretch": Factor("ratio", (1.02, 1.05, 1.08), ("sheet", "max_stretch_ratio")),
     "delay": Factor("ms", (0, 5, 10, 20, 40, 80), on_cables=True),
     "jitter": Factor("ms", (0, 5, 10, 20), on_cables=True),
     "loss": Factor("%", (0, 1, 2, 5, 10, 20), on_cables=True),

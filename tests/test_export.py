@@ -114,6 +114,6 @@ def test_an_export_is_never_written_over(bag: Path, tmp_path: Path) -> None:
 
 
 def test_the_command(bag: Path, tmp_path: Path, flexsheet: Command) -> None:
-    printed = flexsheet("bag", "export", bag, tmp_path / "out.mcap", "--json")
+    printed = flexsheet("bag", "export", bag, "-o", tmp_path / "out.mcap", "--json")
     assert printed.code == 0
     assert printed.json()["messages"]["object"] == 2

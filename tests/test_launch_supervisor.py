@@ -168,7 +168,9 @@ def test_a_port_used_by_a_running_graph_names_the_graph(runs_root: Path) -> None
     assert "--set" not in text
 
 
-@pytest.mark.skipif(not priority._may_set_real_time(7), reason="real time is not permitted")
+@pytest.mark.skipif(
+    priority.find_real_time_priority(7) is None, reason="real time is not permitted"
+)
 async def test_real_time_is_withdrawn_step_by_step_while_a_node_gets_no_processor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
