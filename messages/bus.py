@@ -888,7 +888,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
     if transport == "ipc" and len(os.fsencode(address)) > IPC_PATH_BYTES:
         raise BusError(
             f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(address))} bytes, '
-            f"but the system allows only {IPC_PATH_BYTES}; choose a folder with a shorter path"
+            f"but the system allows only {IPC_PATH_BYTES}; set FLEXSHEET_RUNS to a shorter path"
         )
     if transport not in ("tcp", "ipc"):
         raise BusError(

@@ -70,6 +70,7 @@ MAX_BY_NAME = {
     "min_stretch_ratio": MAX_STRETCH_RATIO,
     "exposure_s": 1.0,
     "latency_s": 10.0,
+    "max_age_s": 10.0,
     "distortion": 1000.0,
     "gain": 1e6,
     "seed": MAX_SEED,
@@ -171,6 +172,8 @@ def _check_number(value: float, name: str) -> None:
         hint = ""
         if name.endswith("_rad") and abs(value) <= MAX_ANGLE_DEG:
             hint = f"; {value:g}° are {math.radians(value):.4g} rad"
+        elif unit == " s" and abs(value) <= 1e3 * find_max_magnitude(name):
+            hint = f"; {value:g} ms are {1e-3 * value:g} s"
         elif unit == " m" and abs(value) <= 1e3 * find_max_magnitude(name):
             hint = f"; {value:g} mm are {1e-3 * value:g} m"
         finite = "" if math.isfinite(value) else ", and a finite number"

@@ -671,7 +671,8 @@ def require_cylinder(scene: Scene) -> Cylinder:
     geometry = scene.object.geometry
     if not isinstance(geometry, Cylinder):
         raise UnfitGeometryError(
-            f'object.geometry.shape of the scene is "{geometry.shape}", expected "cylinder"'
+            f'object.geometry.shape of the scene is "{geometry.shape}", expected "cylinder"; '
+            "choose a scene with a cylinder, such as --scene cylinder"
         )
     return geometry
 

@@ -18,7 +18,10 @@ from typing import Any
 
 import pytest
 
+from flexsheet.launch.commands import arms as arms_command
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import runs, stopping
+from flexsheet.launch.running.runs import Run
 from flexsheet.launch.running.stopping import (
     KILL_AFTER_S,
     StopAttempt,
@@ -28,6 +31,7 @@ from flexsheet.launch.running.stopping import (
 )
 from flexsheet.nodes import stop_socket
 from flexsheet.nodes.stop_socket import MAX_CONNECTIONS, StopSocket
+from tests.console_parts import status_of
 from tests.waiting import DEADLINE_S, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -152,6 +156,16 @@ def test_the_arms_of_each_of_several_graphs_are_reported(graph: Graph) -> None:
     assert ("launcher", "launch", "confirmed") in outcomes(answer)
     modes = {(arm["run"], arm["mode"]) for arm in answer["arms"]}
     assert modes == {(str(graph.run.directory), "estop"), (str(other.directory), "silent")}
+
+
+async def test_a_bridge_without_its_arm_states_the_reason() -> None:
+    plan = load_graph(ROOT / "launch" / "demo.yaml")
+    arms = arms_command._Arms(plan, Run("unused", Path("unused")))
+    note = "waiting for the arm: no connection to 127.0.0.1:5099"
+    arms._on_message(status_of("arm_left_bridge", note=note), None)
+    arms._on_message(status_of("planner", note="follows the finger"), None)
+    rows = arms_command._rows(arms.states, arms.notes)
+    assert [row["reason"] for row in rows] == [note, "no message from the bridge"]
 
 
 def test_without_a_graph_there_is_nothing_to_stop() -> None:

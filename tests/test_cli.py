@@ -729,7 +729,7 @@ def test_a_setting_that_is_no_yaml_is_named(flexsheet: Command) -> None:
 
 def test_verify_reports_missing_inputs(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
     printed = flexsheet("bag", "verify", recorded, "listner")
-    assert (printed.code, 'did you mean "listener"?' in printed.err) == (1, True)
+    assert (printed.code, 'did you mean "listener"?' in printed.err) == (2, True)
     printed = flexsheet("bag", "verify", recorded, "recorder")
     assert (printed.code, "it recorded this bag" in printed.err) == (1, True)
     bare = tmp_path / "bare.mcap"

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 import tempfile
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.topics import find_topic
@@ -113,13 +117,30 @@ def test_the_plot_script_reads_a_bag(tmp_path: Path) -> None:
 
 def test_the_library_script_runs(tmp_path: Path) -> None:
     """The script runs with a graph of one node, which publishes fingertips."""
-    script = python_block("library.md", "flexsheet.load_graph")
+    script = python_block("library.md", "flexsheet.read_topic")
     (tmp_path / "launch").mkdir()
     (tmp_path / "launch" / "demo.yaml").write_text(
         "nodes: {source: {type: 'tests.launch_nodes:FingertipSource'}}\n"
     )
-    assert len(run_script(script, tmp_path).splitlines()) == 3
-    assert len([line for line in script.splitlines() if line.strip()]) <= 12
+    assert len(run_script(script, tmp_path).splitlines()) == 30
+    assert len([line for line in script.splitlines() if line.strip()]) <= 13
+
+
+@pytest.mark.alone
+def test_the_script_that_moves_the_finger_runs(tmp_path: Path) -> None:
+    (tmp_path / "launch").mkdir()
+    launch_file = tmp_path / "launch" / "demo.yaml"
+    launch_file.write_text(f"extends: {ROOT / 'launch/demo.yaml'}\n")
+    ports: dict[str, dict[str, int]] = defaultdict(dict)
+    for setting in choose_ports(launch_file):
+        name, _, port = setting.partition("=")
+        node, _, key = name.partition(".")
+        ports[node][key] = int(port)
+    nodes = {node: {"parameters": values} for node, values in ports.items()}
+    launch_file.write_text(f"{launch_file.read_text()}nodes: {json.dumps(nodes)}\n")
+    printed = run_script(python_block("library.md", "flexsheet.Driver"), tmp_path)
+    position_m = [float(one) for one in printed.strip("[]\n ").split()]
+    assert position_m == pytest.approx([0.0, 0.0, 0.02], abs=0.003)
 
 
 def test_the_launch_files_of_the_node_tutorial_run(tmp_path: Path) -> None:

@@ -53,6 +53,14 @@ async def test_a_path_with_the_label_of_the_previous_path_is_awaited(
     assert follow.done()
 
 
+async def test_a_driver_reads_given_topics_and_names_the_others(tmp_path: Path) -> None:
+    plan = load_graph(DEMO_FILE)
+    async with Driver(plan, Run("run", tmp_path), topics=["fingertip"]) as driver:
+        assert driver.newest("fingertip") is None
+        with pytest.raises(KeyError, match=r'topics=\["stereo"\]'):
+            driver.newest("stereo")
+
+
 def make_driver(monkeypatch: pytest.MonkeyPatch) -> Driver:
     """Make a driver that receives only the messages that the test passes."""
     driver = Driver(load_graph(DEMO_FILE), Run("unused", Path("unused")))

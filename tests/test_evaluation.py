@@ -43,6 +43,7 @@ from flexsheet.launch.experiments.stroke_table import (
 )
 from flexsheet.launch.experiments.sweep import TrialError, execute_trial, run_sweep
 from flexsheet.launch.experiments.trial import read_flags, run_sensitivity_trial
+from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.bag import BagWriter
@@ -427,7 +428,7 @@ def test_parameters_that_matter_in_motion_are_evaluated_in_simulated_time() -> N
 
 
 def test_an_unknown_parameter_is_refused() -> None:
-    with pytest.raises(ExperimentError, match=r"sheet\.modulus_ration.*sheet\.modulus_ratio"):
+    with pytest.raises(BadInputError, match=r"sheet\.modulus_ration.*sheet\.modulus_ratio"):
         select_names(["sheet.modulus_ration"], TOLERANCES, "parameter")
 
 

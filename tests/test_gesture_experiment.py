@@ -14,12 +14,13 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch.commands.options import split_names
 from flexsheet.launch.experiments import ExperimentError, gestures, select_names
+from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import Fingertip, TwinFinger
-from flexsheet.nodes.twin.finger import FingerMotion
+from flexsheet.nodes.twin.finger import FingerMotion, FingerPathError
 from tests.commands import Command
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -254,7 +255,7 @@ def test_every_gesture_of_the_demos_scene_is_labelled_by_its_name(name: str) -> 
 def test_names_are_chosen_once_each_and_checked() -> None:
     assert select_names([], gestures.GESTURES, "gesture") == list(gestures.GESTURES)
     assert select_names(["tap", "stop", "tap"], gestures.GESTURES, "gesture") == ["tap", "stop"]
-    with pytest.raises(ExperimentError, match=r'unknown gesture "tapp"; did you mean "tap"\?'):
+    with pytest.raises(BadInputError, match=r'tapp: unknown gesture; did you mean "tap"\?'):
         select_names(["hold", "tapp"], gestures.GESTURES, "gesture")
     # One value with commas is the former form of a repeated option.
     assert split_names(["tap, stop", "hold"]) == ["tap", "stop", "hold"]
@@ -268,10 +269,10 @@ def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:
     hand = tmp_path / "hand.csv"
     hand.write_text("t_s,x_mm,y_mm,z_mm\n0,0,0,0\n1,20,30,-40\n2,0,10,5\n")
     assert gestures.finger_path(launch_file, str(hand)).label == "hand"
-    wrong = r'"stopp" is neither a gesture nor a file; did you mean "stop"\?'
-    with pytest.raises(ExperimentError, match=wrong):
+    wrong = r'stopp: neither a gesture nor a file; did you mean "stop"\?'
+    with pytest.raises(BadInputError, match=wrong):
         gestures.finger_path(launch_file, "stopp")
-    with pytest.raises(ExperimentError, match=r"absent\.csv: the file cannot be read"):
+    with pytest.raises(FingerPathError, match=r"absent\.csv: the file cannot be read"):
         gestures.finger_path(launch_file, str(tmp_path / "absent.csv"))
 
 
@@ -282,5 +283,5 @@ def test_a_wrong_name_is_answered_in_a_sentence(
     arguments: tuple[str, ...], flexsheet: Command
 ) -> None:
     printed = flexsheet(*arguments)
-    assert printed.code == 1
+    assert printed.code == 2
     assert 'did you mean "tap"?' in printed.err

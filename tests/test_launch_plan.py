@@ -104,6 +104,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ("", "the file is empty"),
         ("- a\n", "write a mapping of keys and values"),
         ("nodes: {a: [}\n", "graph.yaml:1: the file is not valid YAML"),
+        ("nodes:\n\ta: 1\n", "indent with spaces, not tabs"),
         ("nodes: {}\n", "the graph has no node"),
         ("nodes:\n  a: {type: x}\n  a: {type: y}\n", "duplicate key"),
         (GRAPH + "hots: {}\n", 'graph.yaml:9: hots: unknown key "hots"; did you mean "hosts"?'),
@@ -207,6 +208,7 @@ def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
     ("setting", "printed"),
     [
         ("beacon", "write node.parameter=value"),
+        ("console.page_port=8081", 'unknown node "console"; add --console'),
         ("beacn.rate_hz=3", 'unknown node "beacn"; did you mean "beacon"?'),
         ("beacon.rate=3", 'unknown key "rate"; did you mean "rate_hz"?'),
         ("beacon.rate=3", '--set beacon.rate=3: nodes.beacon.parameters.rate: unknown key "rate"'),

@@ -168,6 +168,17 @@ def test_a_port_used_by_a_running_graph_names_the_graph(runs_root: Path) -> None
     assert "--set" not in text
 
 
+def test_the_processes_find_node_classes_beside_the_script(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own.py").touch()
+    (tmp_path / "package").mkdir()
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    assert supervisor._own_module_folders(["own:Guard"]) == [str(tmp_path)]
+    assert supervisor._own_module_folders(["package.guard:Guard"]) == [str(tmp_path)]
+    assert supervisor._own_module_folders(["planner", "elsewhere:Guard"]) == []
+
+
 @pytest.mark.skipif(
     priority.find_real_time_priority(7) is None, reason="real time is not permitted"
 )

@@ -133,6 +133,8 @@ def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], va
         (("object", "geometry", "radius_m"), 1e300, "object.geometry.radius_m"),
         (("object", "geometry", "radius_m"), 4.0, "4.0 is invalid; give at most 2 m"),
         (("object", "geometry", "radius_m"), 45.0, "give at most 2 m; 45 mm are 0.045 m"),
+        (("working_range", "push_depth_m"), 0.2, "push_depth_m: 0.2 m is more than the size of"),
+        (("tolerances", "latency_s"), 35.0, "give at most 10 s; 35 ms are 0.035 s"),
         (("sheet", "max_stretch_ratio"), 8.0, "sheet.max_stretch_ratio: 8.0 is invalid; give at"),
         (("sheet", "young_modulus_pa"), 3e9, "sheet.min_stretch_ratio: 1.02 needs "),
         (("object", "geometry", "radius_m"), -0.1, "give a value greater than 0 m"),

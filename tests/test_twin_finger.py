@@ -385,6 +385,14 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
     assert node.note.endswith("increase the times")
     assert [one.code for one in find_entries(node.note)] == ["finger-path-refused"]
     assert np.array_equal(node.truth(10**9).position, before)
+    far = fast.model_copy(
+        update={
+            "times_s": np.array([0.0, 60.0]),
+            "positions_world_m": np.array([[0, 0, 20], [0, 0, -5.0]]),
+        }
+    )
+    await node.step("twin__finger_path", far, header())
+    assert node.note.endswith("give positions in metres (20 mm are 0.02)")
     slow = fast.model_copy(update={"label": "slow", "times_s": np.array([0.0, 1.0])})
     await node.step("twin__finger_path", slow, header())
     assert node.note == 'follows the path "slow"'

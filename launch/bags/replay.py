@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.documents import BadInputError, did_you_mean
 from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
 from flexsheet.messages.bag import BagError, BagReader
 from flexsheet.messages.base import Header, Message
@@ -158,15 +158,14 @@ def verify(
     progress: function that is called with the number of replayed messages and the total number of
         messages.
 
-    Raises BagError if the node cannot be replayed, or if the bag does not contain the node, its
-    inputs or a valid launch file.
+    Raises BagError if the node cannot be replayed, or if the bag does not contain its inputs or a
+    valid launch file. Raises BadInputError if the bag does not contain the node.
     """
     reader = BagReader(bag)
     plan = _read_plan(reader)
     if name not in plan.nodes:
-        raise BagError(
-            f'{bag}: its plan contains no node "{name}"; {did_you_mean(name, list(plan.nodes))}'
-        )
+        what = f'its plan contains no node "{name}"'
+        raise BadInputError.single(str(bag), (), what, did_you_mean(name, list(plan.nodes)))
     node = plan.nodes[name]
     try:
         why = refusal(node)

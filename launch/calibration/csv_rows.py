@@ -27,14 +27,20 @@ def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, s
             reader = csv.DictReader(file, restval="")
             rows = [(f"{path}:{reader.line_num}", row) for row in reader]
             found = tuple(reader.fieldnames or ())
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BadInputError.single(
-            str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8"
-        ) from error
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BadInputError.single(str(path), (), f"{error}", "give a CSV file in UTF-8") from error
     missing = list_missing(str(path), found, columns)
     if missing:
         raise BadInputError(missing)
     return rows
+
+
+def _unreadable(path: Path, error: OSError) -> BadInputError:
+    return BadInputError.single(
+        str(path), (), f"cannot be read: {error.strerror}", "check the path"
+    )
 
 
 def read_table(
@@ -56,10 +62,10 @@ def read_table(
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInputError.single(
-            str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8"
-        ) from error
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    except UnicodeDecodeError as error:
+        raise BadInputError.single(str(path), (), f"{error}", "give a CSV file in UTF-8") from error
     lines = [
         (number, [cell.strip() for cell in next(csv.reader([line]))])
         for number, line in enumerate(text.splitlines(), start=1)

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 app = make_app("Show, enable, disable, stop and reset the arms of a running graph.")
 
 SIDES = ("left", "right")
-TOPICS = ("arm_left", "arm_right")
+TOPICS = ("arm_left", "arm_right", "status")
 CONFIRMATION_TIMEOUT_S = 3.0
 MAX_STATE_AGE_S, POLL_PERIOD_S = 0.5, 0.02
 
@@ -278,6 +278,7 @@ class _Arms:
         self._subscribers: list[Subscriber] = []
         self._writer: GraphWriter | None = None
         self.states: dict[str, ArmState] = {}
+        self.notes: dict[str, str] = {}
         self.problems: list[str] = []
 
     async def __aenter__(self) -> Self:
@@ -285,7 +286,7 @@ class _Arms:
 
         for topic in TOPICS:
             subscriber = make_subscriber(
-                topic, self._plan, self._run, self._on_state, on_problem=self.problems.append
+                topic, self._plan, self._run, self._on_message, on_problem=self.problems.append
             )
             self._subscribers.append(subscriber)
             subscriber.start()
@@ -297,7 +298,21 @@ class _Arms:
         for subscriber in self._subscribers:
             subscriber.close()
 
-    def _on_state(self, state: Any, _: Any) -> None:
+    def _on_message(self, message: Any, _: Any) -> None:
+        from flexsheet.messages.types import Status
+
+        if isinstance(message, Status):
+            side = (
+                self._plan.nodes[message.node].arm_side
+                if message.node in self._plan.nodes
+                else None
+            )
+            if side is not None:
+                self.notes[side] = message.last_error or message.note
+        else:
+            self._on_state(message)
+
+    def _on_state(self, state: ArmState) -> None:
         self.states[state.side], self._received_s[state.side] = state, self._loop.time()
 
     async def publish(self, topic: str, message: Message) -> None:
@@ -364,25 +379,33 @@ def _command(
             if command is not None:
                 await arms.publish(*command)
             confirmed = await arms.wait_for(done)
-        print_rows(_rows(arms.states), as_json=as_json)
+        print_rows(_rows(arms.states, arms.notes), as_json=as_json)
         for text in arms.problems:
             words.print(text)
         if not confirmed:
             words.print(
-                "[red]not confirmed[/]: see the reasons above and the bridges' logs", markup=True
+                "[red]not confirmed[/]: see the reasons above, and `flexsheet status`", markup=True
             )
+            if any(state.mode == "estop" for state in arms.states.values()):
+                words.print("an e-stop is engaged; to release it: flexsheet arms reset")
         return 0 if confirmed else FAILED
 
     return run_interruptible(work())
 
 
-def _rows(arms: dict[str, ArmState]) -> list[dict[str, Any]]:
+def _rows(arms: dict[str, ArmState], notes: dict[str, str]) -> list[dict[str, Any]]:
+    """Return one table row for each arm.
+
+    notes: note of each arm's bridge, by side, which is the reason of an arm without a state.
+    """
     return [
         {
             "side": side,
             "mode": arms[side].mode if side in arms else "silent",
             "ready": side in arms and arms[side].ready,
-            "reason": arms[side].reason if side in arms else "no message from the bridge",
+            "reason": arms[side].reason
+            if side in arms
+            else notes.get(side) or "no message from the bridge",
             "faults": list(arms[side].faults) if side in arms else [],
         }
         for side in SIDES
@@ -409,7 +432,7 @@ def _show_stop(results: list[_StopResult], as_json: bool) -> None:
         for result in results
         for one in result.attempts
     ]
-    arms = [{**name_run(result), **row} for result in results for row in _rows(result.arms)]
+    arms = [{**name_run(result), **row} for result in results for row in _rows(result.arms, {})]
     if as_json:
         stopped = all(result.confirmed for result in results)
         print_json({"stopped": stopped, "paths": paths, "arms": arms})

@@ -215,7 +215,12 @@ def info(bag: options.BagArgument, as_json: options.JsonOption = False) -> None:
         [
             ("bag", summary.path),
             ("size", f"{summary.size_bytes / 1e6:.2f} MB"),
-            ("complete", "yes" if summary.complete else f"no: {summary.problem}"),
+            (
+                "complete",
+                "yes (the content of the messages is not checked)"
+                if summary.complete
+                else f"no: {summary.problem}",
+            ),
             ("duration", f"{summary.duration_s:.3f} s"),
             ("messages", summary.count),
             *(pair for table in summary.metadata.values() for pair in table.items()),

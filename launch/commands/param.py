@@ -150,7 +150,9 @@ def set_parameter(
 def _find_parameter(plan: ResolvedGraph, text: str) -> tuple[ResolvedNode, str]:
     from flexsheet.launch.plans.documents import did_you_mean
 
-    node_name, _, name = text.partition(".")
+    node_name, dot, name = text.partition(".")
+    if not dot:
+        raise CommandError(f'"{text}": the node is missing; write NODE.PARAMETER')
     node = find_node(plan, node_name)
     if name not in node.parameters:
         raise CommandError(

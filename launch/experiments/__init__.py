@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import TypeVar
 
-from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.documents import BadInputError, did_you_mean
 from flexsheet.messages.errors import FlexsheetError
 
 Entry = TypeVar("Entry")
@@ -53,11 +53,11 @@ class ArmsNotReadyError(ExperimentError):
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
     """Return the given names without duplicates; if none are given, return all known names.
 
-    kind: noun for the names in the error text. Raises ExperimentError if a name is unknown.
+    kind: noun for the names in the error text. Raises BadInputError if a name is unknown.
     """
     for name in names:
         if name not in known:
-            raise ExperimentError(f'unknown {kind} "{name}"; {did_you_mean(name, list(known))}')
+            raise BadInputError.single(name, (), f"unknown {kind}", did_you_mean(name, list(known)))
     return list(dict.fromkeys(names or known))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal, Self, get_args
 
@@ -129,13 +129,18 @@ class Driver:
         run: Run,
         pids: Callable[[], Mapping[str, int]] = dict,
         publish_scene: Callable[[Scene], int] | None = None,
+        *,
+        topics: Iterable[str] = (),
     ) -> None:
         """Create a driver; `async with` connects it to the graph.
 
+        plan, run: attributes of a `RunningGraph`.
         pids: function that returns the process id of each running node, for measurements.
         publish_scene: function that publishes a new scene, and returns the source timestamp of the
             scene.
+        topics: topics to read in addition to those of `READ`.
         """
+        self._topics = dict.fromkeys((*READ, *topics))
         self._plan, self._run, self.pids = plan, run, pids
         self._publish_scene = publish_scene
         self.on_message: Callable[[Message], None] = lambda message: None
@@ -150,7 +155,7 @@ class Driver:
 
     async def __aenter__(self) -> Self:
         self._writer = GraphWriter(self._plan, self._run, WRITTEN)
-        for name in READ:
+        for name in self._topics:
             self._subscribe(name)
         return self
 
@@ -269,6 +274,15 @@ class Driver:
         return OverloadedError("; ".join([what, *busy, remedy, ending]))
 
     def newest(self, topic: str) -> Message | None:
+        """Return the newest message of a topic, or None if none has arrived yet.
+
+        Raises KeyError if the driver does not read the topic.
+        """
+        if topic not in self._subscribers:
+            raise KeyError(
+                f"the driver does not read {topic}; give it to the constructor: "
+                f'topics=["{topic}"] (it reads {", ".join(self._subscribers) or "nothing"})'
+            )
         return self._newest.get(topic)
 
     async def wait_ready(self) -> None:
@@ -351,6 +365,7 @@ class Driver:
         await self.wait_ready()
 
     def move_finger(self, path: FingerPath) -> None:
+        """Start to move the simulated finger along a path; do not wait for the end."""
         self._publish("twin/finger_path", path)
 
     async def follow(self, path: FingerPath) -> None:

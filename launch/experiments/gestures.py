@@ -18,7 +18,7 @@ from flexsheet.launch.experiments import ExperimentError, find_recorded, stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.launch.experiments.run import Procedure, Progress
-from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.documents import BadInputError, did_you_mean
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, UnfitGeometryError
@@ -76,7 +76,8 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
     name_or_file: name of a gesture, or CSV file with a recorded path.
     settings: launch settings "node.parameter=value". "scene=FILE" replaces the scene.
 
-    Raises ExperimentError if the path is unknown or invalid.
+    Raises BadInputError if the name is unknown, FingerPathError if the recorded path is invalid,
+    and ExperimentError if the launch file has no scene.
     """
     scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:
@@ -87,14 +88,13 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
         return gesture_path(name_or_file, scene)
     file = Path(name_or_file)
     if not file.suffix and not file.exists():
-        raise ExperimentError(
-            f'"{name_or_file}" is neither a gesture nor a file; '
-            f"{did_you_mean(name_or_file, list(GESTURES))} A recorded finger is given as a CSV file"
+        raise BadInputError.single(
+            name_or_file,
+            (),
+            "neither a gesture nor a file",
+            f"{did_you_mean(name_or_file, list(GESTURES))} A recorded finger is a CSV file",
         )
-    try:
-        return recorded_path(file, scene)
-    except FingerPathError as error:
-        raise ExperimentError(str(error)) from None
+    return recorded_path(file, scene)
 
 
 def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:

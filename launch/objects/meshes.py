@@ -99,7 +99,22 @@ def make_scene(document: Document) -> Scene:
     load_arm_models(document)
     scene = validate(Scene, document)
     _check_edge_force(scene, document)
+    _check_push_depth(scene, document)
     return scene
+
+
+def _check_push_depth(scene: Scene, document: Document) -> None:
+    """Raise BadInputError if the finger would push deeper than the largest size of a solid."""
+    geometry = scene.object.geometry
+    if geometry.shape == "plane":
+        return
+    extent_m = GEOMETRIES[geometry.shape].extent_m
+    axes = np.eye(3)
+    size_m = max(extent_m(geometry, axis) + extent_m(geometry, -axis) for axis in axes)
+    depth_m = scene.working_range.push_depth_m
+    if depth_m > size_m:
+        what = f"{depth_m:g} m is more than the size of the object, {size_m:.3g} m"
+        raise document.error(("working_range", "push_depth_m"), what, "give a smaller depth")
 
 
 def _check_edge_force(scene: Scene, document: Document) -> None:

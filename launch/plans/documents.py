@@ -77,6 +77,8 @@ SCALARS: tuple[tuple[type, type], ...] = (
 )
 """The scalar types of the YAML parser, which preserve formatting, and their Python types."""
 
+YAML_REMEDY = "correct this line; indent with spaces, not tabs, and quote texts with `: ` or ` #`"
+
 MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
 """The types of pydantic errors for values that should be mappings."""
 
@@ -369,7 +371,7 @@ def read_document(path: Path) -> Document:
         mark = error.problem_mark or error.context_mark
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         what = f"the file is not valid YAML: {error.problem}"
-        raise BadInputError.single(where, (), what) from error
+        raise BadInputError.single(where, (), what, YAML_REMEDY) from error
     except YAMLError as error:
         raise BadInputError.single(str(path), (), f"the file is not valid YAML: {error}") from error
     if not isinstance(tree, CommentedMap):

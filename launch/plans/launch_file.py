@@ -267,7 +267,8 @@ def apply_setting(document: Document, setting: str) -> None:
     elif node == "recorder" and "record" in document.values:
         document.set(("record", *inner), value, origin)
     else:
-        raise BadInputError.single(origin, (), f'unknown node "{node}"', did_you_mean(node, known))
+        remedy = "add --console" if node == "console" else did_you_mean(node, known)
+        raise BadInputError.single(origin, (), f'unknown node "{node}"', remedy)
 
 
 def apply_record(document: Document, bag: Path) -> None:

@@ -63,6 +63,11 @@ class CpuWatch:
         self._history: deque[Waits] = deque()
         self._cpu_before: tuple[float, dict[tuple[str, int], float]] | None = None
 
+    @property
+    def can_measure(self) -> bool:
+        """Whether the kernel counts waiting times."""
+        return (self._proc / "self" / "schedstat").exists()
+
     def update(
         self,
         watched: Mapping[str, int],

@@ -35,6 +35,7 @@ from flexsheet.messages.security import KeyChange, KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import (
     ArmState,
+    CpuPressure,
     EStop,
     HostKey,
     HostStatus,
@@ -354,6 +355,16 @@ class HostAgent:
                 )
                 return
 
+    def _measure_cpu(self, watched: dict[str, int], pids: dict[str, int]) -> CpuPressure | None:
+        """Return how long nodes wait for a processor, or None if the kernel does not count it.
+
+        Until the first nodes have been watched for a second, the waiting time is stated as 0.
+        """
+        found = self._cpu.update(watched, pids)
+        if found is None and self._cpu.can_measure:
+            return CpuPressure(busy=False, wait_ratio=0.0, node="")
+        return found
+
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
         processes, pids = self._processes(), self._pids()
@@ -385,7 +396,7 @@ class HostAgent:
             if self._keys is None
             else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
             estop=None if self._latched is None else self._latched.reason,
-            cpu=self._cpu.update(watched, pids),
+            cpu=self._measure_cpu(watched, pids),
             nice_denied=self._nice_denied,
         )
 

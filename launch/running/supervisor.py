@@ -19,8 +19,9 @@ import os
 import signal
 import stat
 import subprocess
+import sys
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -314,6 +315,17 @@ def _start_python(
         )
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def _own_module_folders(node_types: Iterable[str]) -> list[str]:
+    """Return the folder of the running script if it contains modules of node classes.
+
+    Python searches this folder only in the process of the script, not in those of the nodes.
+    """
+    script = Path(sys.path[0] or ".").resolve()
+    names = {one.partition(":")[0].partition(".")[0] for one in node_types if ":" in one}
+    is_own = any((script / f"{one}.py").is_file() or (script / one).is_dir() for one in names)
+    return [str(script)] if is_own else []
 
 
 class RunningGraph:
@@ -806,6 +818,9 @@ class RunningGraph:
         # The processes of the graph already use all cores; BLAS threads would compete with them.
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment.setdefault(variable, "1")
+        if folders := _own_module_folders(node.type for node in self.nodes):
+            existing = environment.get("PYTHONPATH")
+            environment["PYTHONPATH"] = os.pathsep.join([*folders, *filter(None, [existing])])
         return environment
 
     def _start_fork_server(self) -> None:

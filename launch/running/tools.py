@@ -120,6 +120,13 @@ async def read_topic(
         subscriber.close()
 
 
+def check_writable(plan: ResolvedGraph, run: Run, topic: str) -> None:
+    """Raise BadInputError if tools on this host are not allowed to write a topic."""
+    host = tools_host(run)
+    if plan.writer(topic, tools_on(host)) is None:
+        raise _make_refusal(plan, topic, host)
+
+
 class GraphWriter:
     """A publisher of topics for tools outside the running graph.
 

@@ -32,10 +32,15 @@ WANDER_BAND_HZ = (0.15, 1.2)
 TREMOR_BAND_HZ = (8.0, 12.0)
 
 
+MAX_COORDINATE_M = 2.0
+"""The maximum coordinate of a path (m). A larger one is probably in mm."""
+
+
 class FingerPathError(FlexsheetError, ValueError):
     """Raised if the simulated finger cannot follow a path."""
 
     code = "finger-path"
+    exit_code = 2
     remedy = "Slow the path down, or correct the point or line that the error text names."
 
 
@@ -245,12 +250,20 @@ def find_clamped_rates(times_s: Floats, points: Floats) -> Floats:
 def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
     """Check the points (n, 3) and times (n,) of a path, and return the motion through these points.
 
-    Raises FingerPathError if the path has no points or its times do not increase.
+    Raises FingerPathError if the path has no points, a point is too far away, or its times do not
+    increase.
     """
     if len(times_s) != len(points) or len(times_s) == 0:
         raise FingerPathError(
             f"the path has {len(times_s)} times and {len(points)} points; give one time per point, "
             "and at least one point"
+        )
+    far = np.abs(points).max(axis=1) > MAX_COORDINATE_M
+    if far.any():
+        at = int(np.argmax(far))
+        raise FingerPathError(
+            f"path: the point {at}, {points[at].tolist()} m, is more than {MAX_COORDINATE_M:g} m "
+            "from the centre of the screen; give positions in metres (20 mm are 0.02)"
         )
     steps_s = np.diff(times_s)
     if (steps_s <= 0).any():
