@@ -70,6 +70,14 @@ class BagError(FlexsheetError):
     )
 
 
+class NoBagError(BagError):
+    """Raised if a bag does not exist."""
+
+    code = "no-bag"
+    exit_code = 2
+    remedy = "Check the path. Recordings are in the folder `runs`, unless a path was given."
+
+
 def join_frames(frames: Sequence[Any]) -> bytes:
     """Encode the ZeroMQ frames (parts) of a message as the data of one MCAP record.
 
@@ -413,6 +421,8 @@ class BagReader:
             with self.path.open("rb") as file:
                 self._scan(file)
                 self._index_remaining_chunks(file)
+        except FileNotFoundError as error:
+            raise NoBagError(f"{self.path}: the file does not exist; check the path") from error
         except OSError as error:
             raise BagError(
                 f"{self.path}: cannot be read: {error.strerror or error}; check the path"

@@ -739,7 +739,7 @@ def test_verify_reports_missing_inputs(flexsheet: Command, recorded: Path, tmp_p
         'does not contain the attachment "plan.json"'
         in flexsheet("bag", "verify", bare, "listener").err
     )
-    assert flexsheet("bag", "info", tmp_path / "no.mcap").code == 1
+    assert flexsheet("bag", "info", tmp_path / "no.mcap").code == 2
 
 
 def test_a_bag_plays_into_a_graph(

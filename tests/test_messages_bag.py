@@ -23,6 +23,7 @@ from flexsheet.messages.bag import (
     BagError,
     BagReader,
     BagWriter,
+    NoBagError,
     info,
     join_frames,
     recover,
@@ -328,7 +329,7 @@ def test_common_foreign_files_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "empty").touch()
     with pytest.raises(BagError, match="is empty"):
         info(tmp_path / "empty")
-    with pytest.raises(BagError, match="cannot be read"):
+    with pytest.raises(NoBagError, match="does not exist"):
         info(tmp_path / "absent")
     with pytest.raises(BagError, match="cannot be read"):
         info(tmp_path)
