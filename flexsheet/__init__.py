@@ -12,6 +12,7 @@ import sys
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from flexsheet.launch.bags.parquet import read_table
+    from flexsheet.launch.commands.graph import running_graph
     from flexsheet.launch.experiments import ExperimentError
     from flexsheet.launch.experiments.driver import Driver
     from flexsheet.launch.experiments.run import run_experiment
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 _EXPORTS = {
     "flexsheet.launch.bags.parquet": ("read_table",),
+    "flexsheet.launch.commands.graph": ("running_graph",),
     "flexsheet.launch.experiments": ("ExperimentError",),
     "flexsheet.launch.experiments.driver": ("Driver",),
     "flexsheet.launch.experiments.run": ("run_experiment",),
@@ -82,6 +84,7 @@ __all__ = [
     "read_topic",
     "recover",
     "run_experiment",
+    "running_graph",
 ]
 
 

@@ -112,7 +112,8 @@ def read_calibration(kind: type[Calibration], path: Path, *, command: str) -> Ca
         content = _parse(path)
     except OSError as error:
         raise CalibrationFileError(
-            f"{path}: cannot be read: {error.strerror}; use a file that `{command}` wrote"
+            f"{path}: cannot be read: {error.strerror}; check the path, which is relative to the "
+            f"file that names it, or write the calibration with `{command}`"
         ) from error
     # The parser raises undocumented errors for invalid numbers and dates.
     except (YAMLError, ValueError, RecursionError, TypeError) as error:

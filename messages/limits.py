@@ -160,8 +160,10 @@ class LimitedModel(BaseModel):
         elif isinstance(value, int | float):
             _check_number(value, name)
             if 0.0 < value < find_min_positive(name) and _refuses_zero(cls, name):
+                unit = _unit_text(name)
+                hint = f"; {value:g} kPa are {1e3 * value:g} Pa" if unit == " Pa" else ""
                 raise ValueError(
-                    f"give at least {find_min_positive(name):g}{_unit_text(name)}, not {value:g}"
+                    f"give at least {find_min_positive(name):g}{unit}, not {value:g}{hint}"
                 )
         return value
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexsheet import read_topic, running_graph
 from flexsheet.launch.commands.scene import keys
 from flexsheet.launch.commands.session import describe_node, describe_output, explain_counts
 from flexsheet.launch.experiments.run import DEMO_FILE
@@ -599,6 +600,13 @@ def test_the_running_graph_is_printed_and_drawn(
     assert flexsheet("graph", "-o", tmp_path / "graph.gif").code == 2
 
 
+@pytest.mark.usefixtures("running")
+async def test_a_program_reads_a_graph_of_another_process() -> None:
+    graph = running_graph()
+    read = [header.writer async for _, header in read_topic(graph, "twin/finger", count=2)]
+    assert read == ["beacon", "beacon"]
+
+
 def test_a_node_that_runs_is_not_started_again(flexsheet: Command, running: Path) -> None:
     printed = flexsheet("run", "beacon")
     assert (printed.code, "--without beacon" in printed.err) == (1, True)
@@ -618,8 +626,23 @@ def test_fields_of_a_bag_are_plotted(flexsheet: Command, recorded: Path, tmp_pat
     assert "twin/finger: name a field of this topic; choose from: twin/finger.path" in printed.err
     assert "twin/finger.position_world_m" in printed.err
     assert "path_label" not in printed.err, "a text cannot be plotted"
+    depth = "twin/finger.position_world_m.z"
+    (z,) = flexsheet("bag", "plot", recorded, depth, "-o", image, "--json").json()
+    assert np.array(z["values"]).tolist() == np.array(position["values"])[:, [2]].tolist()
+    assert (
+        'unknown component "q"; choose one of: x, y, z'
+        in flexsheet("bag", "plot", recorded, "twin/finger.position_world_m.q").err
+    )
     printed = flexsheet("bag", "plot", recorded, "twin/finger.position_wrld_m")
     assert (printed.code, 'did you mean "position_world_m"?' in printed.err) == (2, True)
+
+
+def test_a_node_that_is_omitted_must_exist(flexsheet: Command) -> None:
+    printed = flexsheet("launch", "demo", "--without", "planer", "--dry-run")
+    assert (printed.code, 'did you mean "planner"?' in printed.err) == (2, True)
+    printed = flexsheet("launch", "demo", "--without", "planner", "--dry-run")
+    assert printed.code == 0
+    assert not [line for line in printed.out.splitlines() if line.startswith("planner ")]
 
 
 def test_a_node_runs_alone_and_a_graph_is_stopped(tmp_path: Path, runs_root: Path) -> None:

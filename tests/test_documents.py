@@ -142,6 +142,14 @@ class Side(Enum):
     RIGHT = "right"
 
 
+class Twin(BaseModel):
+    kind: Literal["twin"]
+
+
+class Live(BaseModel):
+    kind: Literal["live"]
+
+
 class Values(BaseModel):
     """A model with one value for each type of pydantic error that has its own remedy."""
 
@@ -158,6 +166,7 @@ class Values(BaseModel):
     several: list[int] = []
     pair: tuple[int, int] = (0, 0)
     file: Path = Path()
+    source: Annotated[Twin | Live, Field(discriminator="kind")] = Twin(kind="twin")
     some: Annotated[list[int], Field(min_length=2, max_length=3)] = [0, 0]
 
 
@@ -170,6 +179,8 @@ INVALID = {
     "int_from_float": ("whole: 1.5", "write an integer"),
     "literal_error": ("choice: c", "write 'a' or 'b'"),
     "enum": ("side: c", "write 'left' or 'right'"),
+    "union_tag_invalid": ("source: {kind: twn}", "write 'twin', 'live'"),
+    "union_tag_not_found": ("source: {}", "add the key 'kind'"),
     "string_type": ("name: 3", "write a text"),
     "bool_type": ("on: []", "write true or false"),
     "bool_parsing": ("on: maybe", "write true or false"),

@@ -12,6 +12,7 @@ import typer
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from flexsheet.launch.commands import experiment
 from flexsheet.launch.commands.options import split_names
 from flexsheet.launch.experiments import ExperimentError, gestures, select_names
 from flexsheet.launch.plans.documents import BadInputError
@@ -274,6 +275,20 @@ def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:
         gestures.finger_path(launch_file, "stopp")
     with pytest.raises(FingerPathError, match=r"absent\.csv: the file cannot be read"):
         gestures.finger_path(launch_file, str(tmp_path / "absent.csv"))
+
+
+def test_the_placement_of_a_recorded_motion_is_stated(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    launch_file = ROOT / "launch" / "demo.yaml"
+    experiment.announce_recording("stop", gestures.finger_path(launch_file, "stop"))
+    assert capsys.readouterr().err == ""
+    hand = tmp_path / "hand.csv"
+    hand.write_text("t_s,x_mm,y_mm,z_mm\n0,0,0,0\n1,20,30,-40\n2,0,10,5\n")
+    experiment.announce_recording(str(hand), gestures.finger_path(launch_file, str(hand)))
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "hand.csv is centred in front of the object" in printed
+    assert "flexsheet topic pub twin/finger_path" in printed
 
 
 @pytest.mark.parametrize(

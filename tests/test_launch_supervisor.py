@@ -173,7 +173,8 @@ def test_the_processes_find_node_classes_beside_the_script(
 ) -> None:
     (tmp_path / "own.py").touch()
     (tmp_path / "package").mkdir()
-    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    script = str(tmp_path / "script.py")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", script, raising=False)
     assert supervisor._own_module_folders(["own:Guard"]) == [str(tmp_path)]
     assert supervisor._own_module_folders(["package.guard:Guard"]) == [str(tmp_path)]
     assert supervisor._own_module_folders(["planner", "elsewhere:Guard"]) == []

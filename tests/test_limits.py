@@ -143,7 +143,11 @@ def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], va
         (("camera", "right_from_left", 3, 3), 0.0, "the last row"),
         (("camera", "right_from_left", 0, 0), 1.1, "must be a rotation"),
         (("camera", "right_from_left", 0, 0), -1.0, "reflection"),
-        (("object", "material", "young_modulus_pa"), 4.0, "give at least 100 Pa, not 4"),
+        (
+            ("object", "material", "young_modulus_pa"),
+            4.0,
+            "Pa, not 4; 4 kPa are 4000 Pa",
+        ),
         (("working_range", "tilt_rad"), 30.0, "30° are 0.5236 rad"),
     ],
 )

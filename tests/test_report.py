@@ -321,7 +321,7 @@ def test_errors_are_listed_with_the_worst_first(numbers: dict[str, Any]) -> None
         "left arm: the edge force reached 25 N; the scene allows 20 N.",
         "planner had 3 errors; the last: on_fingertip: bang.",
         "fingertip: 1 messages were refused",
-        "fingertip stopped once",
+        "The topic fingertip had no messages once",
         "In 10.0 % of the results, the finger was deeper than the range",
     ):
         assert part in printed, part

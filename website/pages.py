@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -95,6 +96,7 @@ def draw_charts(folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # for `| head`
     if sys.argv[1:] == ["site"]:
         build(SITE_INPUT)
         draw_charts(SITE_INPUT / "charts")

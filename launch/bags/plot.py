@@ -137,7 +137,9 @@ def _get_number(bag: Path, name: str, message: BaseModel, path: Sequence[str]) -
     Raises BadInputError if the field does not exist or is not numeric.
     """
     value: Any = message
-    for part in path:
+    for place, part in enumerate(path):
+        if isinstance(value, np.ndarray | tuple):
+            return _get_component(bag, name, value, path[place:])
         fields = type(value).model_fields if isinstance(value, BaseModel) else {}
         if value is None:
             return None
@@ -158,6 +160,17 @@ def _get_number(bag: Path, name: str, message: BaseModel, path: Sequence[str]) -
         what = f"{name}: the field has {numbers.size} numbers, more than {MAX_COMPONENTS}"
         raise BadInputError.single(str(bag), (), what, "choose another field")
     return numbers
+
+
+def _get_component(bag: Path, name: str, value: Any, path: Sequence[str]) -> Floats:
+    """Return one component of a vector, named x, y or z, or by its number from 1."""
+    numbers = _convert_numbers(value)
+    size = 0 if numbers is None else numbers.size
+    known = ["x", "y", "z"][:size] if size <= len("xyz") else [str(1 + i) for i in range(size)]
+    (part, *rest) = path
+    if numbers is None or rest or part not in known:
+        raise _error(bag, f'{name}: unknown component "{part}"', part, known)
+    return numbers[[known.index(part)]]
 
 
 def _make_series(bag: Path, name: str, rows: list[tuple[float, Floats]]) -> FieldSeries:

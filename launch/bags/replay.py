@@ -111,6 +111,7 @@ class Verification:
     missing: number of messages in the execution log that the bag does not contain.
     same_bytes: whether two replays gave the same bytes.
     digest: SHA-256 of the replayed messages, in hexadecimal digits.
+    bag_problem: reason why the bag is incomplete, so that only a part was compared; "" if complete.
     """
 
     node: str
@@ -125,6 +126,7 @@ class Verification:
     last_error: str
     topics: dict[str, Comparison]
     tolerance: float
+    bag_problem: str = ""
 
     @property
     def repeatable(self) -> bool:
@@ -192,6 +194,7 @@ def verify(
         last_error=first.last_error,
         topics=compare(bag, node, first, tolerance),
         tolerance=tolerance,
+        bag_problem=reader.problem,
     )
 
 

@@ -352,6 +352,8 @@ def verify(
     else:
         _print_verification(result)
         words.print(_describe_result(result))
+        if result.bag_problem:
+            words.print(f"only the readable part was compared: {result.bag_problem}")
     if not result.repeatable:
         raise typer.Exit(FAILED)
     if not result.as_live:

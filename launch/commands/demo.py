@@ -11,6 +11,7 @@ import typer
 
 from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.experiment import (
+    announce_recording,
     make_result_folder,
     print_followed,
     print_strokes,
@@ -59,7 +60,10 @@ def demo(
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
     given = options.with_scene(settings, scene)
-    path = None if finger_path is None else load_path(launch_file, finger_path, given)
+    path = None
+    if finger_path is not None:
+        path = load_path(launch_file, finger_path, given)
+        announce_recording(finger_path, path)
     folder = make_result_folder(output, "demo")
     bag, results = folder / "demo.mcap", DemoResult()
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.experiments.driver import TableMethod
     from flexsheet.launch.experiments.hand_gestures import FeltForce
     from flexsheet.launch.experiments.image import Series
+    from flexsheet.messages.types import FingerPath
 
 app = options.make_app("Run the experiments of Furukawa et al. 2007, and further ones, on a graph.")
 
@@ -506,6 +507,21 @@ def print_followed(results: list[dict[str, Any]]) -> None:
             row += [shown(errors[name], ".3f") for name in ("mean", "p95", "max")]
         rows.append(row)
     print_table(columns, rows)
+
+
+def announce_recording(finger_path: str, path: FingerPath) -> None:
+    """State how a path from a CSV file is placed in the scene; state nothing for a gesture.
+
+    finger_path: value of the option --finger-path.
+    """
+    from flexsheet.launch.experiments.gestures import GESTURES
+
+    if finger_path not in GESTURES:
+        words.print(
+            f"the recorded motion of {finger_path} is centred in front of the object, follows its "
+            f"surface, and takes {path.times_s[-1]:.1f} s; `flexsheet topic pub twin/finger_path` "
+            "follows given positions instead"
+        )
 
 
 def print_strokes(results: list[dict[str, Any]]) -> None:

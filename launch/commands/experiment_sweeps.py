@@ -14,6 +14,7 @@ import typer
 from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.experiment import (
     StrokeOption,
+    announce_recording,
     app,
     make_result_folder,
     print_followed,
@@ -259,6 +260,7 @@ def follow(
 
     given = options.with_scene(settings, scene)
     path = load_path(launch_file, finger_path, given)
+    announce_recording(finger_path, path)
     bag = None if simulated_time else make_result_folder(output, "follow") / "follow.mcap"
     with progress_words() as progress:
         result = experiment.run_follow(launch_file, given, bag, path, progress, apparatus=apparatus)

@@ -7,7 +7,7 @@ import signal
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError, words
 from flexsheet.nodes.signals import handle_signals
@@ -64,7 +64,14 @@ def choose_run(directory: Path | None) -> Path | None:
     return None
 
 
-def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
+class ConnectedGraph(NamedTuple):
+    """A graph that another process runs: its resolved graph, and its run."""
+
+    plan: ResolvedGraph
+    run: Run
+
+
+def running_graph(directory: Path | None = None) -> ConnectedGraph:
     """Return the resolved graph and the run that belong to a run directory.
 
     If `directory` is None, the newest running graph is used. Raises CommandError if the directory
@@ -87,7 +94,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
         if not ready:
             raise NoGraphError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]
-    return ResolvedGraph.model_validate_json(run.plan_file.read_text()), run
+    return ConnectedGraph(ResolvedGraph.model_validate_json(run.plan_file.read_text()), run)
 
 
 def find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:

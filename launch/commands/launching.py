@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands import complete, options
-from flexsheet.launch.commands.graph import list_readers
+from flexsheet.launch.commands.graph import find_node, list_readers
 from flexsheet.launch.commands.output import (
     FAILED,
     examples,
@@ -104,12 +104,14 @@ def launch(
         console=console,
         apparatus=apparatus,
     )
+    for name in without or ():
+        find_node(plan, name)
     if dry_run:
         warn_of_loop_risk(plan)
         if as_json:
             print_json(plan.model_dump(mode="json"))
         else:
-            _print_plan(plan, host)
+            _print_plan(plan, host, without or ())
         return
 
     def ready(run: Run) -> None:
@@ -327,7 +329,11 @@ def _format_settings(node: ResolvedNode) -> str:
     )
 
 
-def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
+def _print_plan(plan: ResolvedGraph, host: str | None, without: Collection[str]) -> None:
+    """Print the nodes and the topics of a graph.
+
+    without: names of nodes that are not listed, because the launcher does not start them.
+    """
     words.print(f"plan {plan.hash} of {plan.launch_file}, scene {plan.scene_file or 'none'}")
     if plan.apparatus is not None:
         words.print(
@@ -345,6 +351,7 @@ def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
                 _format_settings(node),
             )
             for node in plan.nodes_on(host)
+            if node.name not in without
         ],
     )
     print_omitted(plan, host)

@@ -99,6 +99,8 @@ REMEDIES = {
     "int_from_float": "write an integer",
     "literal_error": "write {expected}",
     "enum": "write {expected}",
+    "union_tag_invalid": "write {expected_tags}",
+    "union_tag_not_found": "add the key {discriminator}",
     "string_type": "write a text",
     "bool_type": "write true or false",
     "bool_parsing": "write true or false",

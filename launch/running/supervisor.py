@@ -322,7 +322,8 @@ def _own_module_folders(node_types: Iterable[str]) -> list[str]:
 
     Python searches this folder only in the process of the script, not in those of the nodes.
     """
-    script = Path(sys.path[0] or ".").resolve()
+    file = getattr(sys.modules["__main__"], "__file__", None)
+    script = Path.cwd() if file is None else Path(file).resolve().parent
     names = {one.partition(":")[0].partition(".")[0] for one in node_types if ":" in one}
     is_own = any((script / f"{one}.py").is_file() or (script / one).is_dir() for one in names)
     return [str(script)] if is_own else []
@@ -818,6 +819,8 @@ class RunningGraph:
         # The processes of the graph already use all cores; BLAS threads would compete with them.
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment.setdefault(variable, "1")
+        # The camera node reports a camera that cannot be opened.
+        environment.setdefault("OPENCV_LOG_LEVEL", "ERROR")
         if folders := _own_module_folders(node.type for node in self.nodes):
             existing = environment.get("PYTHONPATH")
             environment["PYTHONPATH"] = os.pathsep.join([*folders, *filter(None, [existing])])

@@ -10,7 +10,7 @@ import asyncio
 import itertools
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from flexsheet.launch.plans.plan_model import MAIN, ResolvedGraph, tools_on
 from flexsheet.launch.running.runs import Run, local_endpoints, local_sources, ring_file
@@ -23,7 +23,6 @@ from flexsheet.messages.types import HostStatus, Status
 
 if TYPE_CHECKING:
     from flexsheet.launch.plans.documents import BadInputError
-    from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
 """The time (s) in which all subscribers connect to a new writer.
@@ -90,8 +89,18 @@ def make_subscriber(
     )
 
 
+class Graph(Protocol):
+    """A graph to which a tool can connect, such as a RunningGraph."""
+
+    @property
+    def plan(self) -> ResolvedGraph: ...
+
+    @property
+    def run(self) -> Run: ...
+
+
 async def read_topic(
-    graph: RunningGraph, topic: str, count: int | None = None
+    graph: Graph, topic: str, count: int | None = None
 ) -> AsyncIterator[tuple[Message, Header]]:
     """Yield the messages of a topic of a running graph, with their headers, as they arrive.
 

@@ -213,7 +213,8 @@ def _check_flow(name: str, topic: dict[str, Any]) -> Iterator[SessionFinding]:
         yield SessionFinding("doubtful", text, "topics")
     if topic["silences"]:
         gap_s = topic["longest_silence_s"]
-        text = f"{name} stopped {_times(topic['silences'])}, for at most {gap_s:.2f} s."
+        times = _times(topic["silences"])
+        text = f"The topic {name} had no messages {times}, for at most {gap_s:.2f} s."
         yield SessionFinding("doubtful", text, "topics")
 
 
