@@ -767,6 +767,10 @@ class HostStatus(Message):
 PathJoin = Literal["rounded_lines", "spline"]
 
 
+MAX_PATH_COORDINATE_M = 2.0
+"""The maximum coordinate of a finger path (m). A larger one is probably in mm."""
+
+
 class FingerPath(Message):
     """A path of the simulated finger. The finger first moves smoothly to the first point."""
 
@@ -789,7 +793,10 @@ class FingerPath(Message):
     )
 
     def find_problem(self) -> str:
-        """Return why the times are not valid: one increasing time per point is required."""
+        """Return why the times or points are not valid, or "".
+
+        One increasing time per point is required, and each point must be near the screen.
+        """
         times_s, points = self.times_s, len(self.positions_world_m)
         if len(times_s) != points or points == 0:
             return (
@@ -802,6 +809,14 @@ class FingerPath(Message):
             return (
                 f"times_s[{at + 1}]: {times_s[at + 1]:.6g} does not come after times_s[{at}] = "
                 f"{times_s[at]:.6g}; give increasing times"
+            )
+        far = np.flatnonzero(~(np.abs(self.positions_world_m).max(axis=1) <= MAX_PATH_COORDINATE_M))
+        if len(far):
+            at = int(far[0])
+            return (
+                f"positions_world_m[{at}]: {self.positions_world_m[at].tolist()} m is more than "
+                f"{MAX_PATH_COORDINATE_M:g} m from the centre of the screen; give positions in "
+                "metres (20 mm are 0.02)"
             )
         return ""
 

@@ -15,7 +15,8 @@ from flexsheet.launch.experiments.stroke import stroke_path
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import Run
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.types import CpuPressure, TwinFinger
+from flexsheet.messages.types import CpuPressure, FingerPath, TwinFinger
+from flexsheet.nodes.twin.finger import FingerPathError
 from tests.test_busy import host
 from tests.test_planner import SCENE
 from tests.test_visible_lag import frame
@@ -59,6 +60,23 @@ async def test_a_driver_reads_given_topics_and_names_the_others(tmp_path: Path) 
         assert driver.newest("fingertip") is None
         with pytest.raises(KeyError, match=r'topics=\["stereo"\]'):
             driver.newest("stereo")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "to_m", "problem"),
+    [(2.0, 20.0, "give positions in metres"), (0.01, 0.1, "increase the times")],
+)
+async def test_a_path_that_the_finger_cannot_follow_is_refused_at_once(
+    seconds: float, to_m: float, problem: str
+) -> None:
+    driver = Driver(load_graph(DEMO_FILE), Run("unused", Path("unused")))
+    path = FingerPath(
+        label="wrong",
+        times_s=np.array([0.0, seconds]),
+        positions_world_m=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, to_m]]),
+    )
+    with pytest.raises(FingerPathError, match=problem):
+        await driver.follow(path)
 
 
 def make_driver(monkeypatch: pytest.MonkeyPatch) -> Driver:

@@ -44,6 +44,7 @@ from flexsheet.messages.types import (
 from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
+from flexsheet.nodes.twin.finger import FingerPathError, check_speed, validate_path
 
 TableMethod = Literal["quick_table", "nonlinear_table"]
 TABLE_METHODS: tuple[TableMethod, ...] = get_args(TableMethod)
@@ -141,6 +142,7 @@ class Driver:
         topics: topics to read in addition to those of `READ`.
         """
         self._topics = dict.fromkeys((*READ, *topics))
+        self._scene = plan.scene_message()
         self._plan, self._run, self.pids = plan, run, pids
         self._publish_scene = publish_scene
         self.on_message: Callable[[Message], None] = lambda message: None
@@ -358,14 +360,22 @@ class Driver:
         """Replace the scene of the graph, and wait until its soft body and both arms are ready."""
         if self._publish_scene is None:
             raise RuntimeError("this driver cannot publish a scene")
-        source_ns = self._publish_scene(scene)
+        source_ns, self._scene = self._publish_scene(scene), scene
         await self.wait_for(
             lambda: self._skin_source_ns >= source_ns, "the skin of the new object", 3 * WAIT_S
         )
         await self.wait_ready()
 
     def move_finger(self, path: FingerPath) -> None:
-        """Start to move the simulated finger along a path; do not wait for the end."""
+        """Start to move the simulated finger along a path; do not wait for the end.
+
+        Raises FingerPathError if the finger cannot follow the path.
+        """
+        if problem := path.find_problem():
+            raise FingerPathError(f'path "{path.label}": {problem}')
+        if self._scene is not None:
+            motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+            check_speed(motion, path.times_s, self._scene.finger.max_speed_m_per_s)
         self._publish("twin/finger_path", path)
 
     async def follow(self, path: FingerPath) -> None:

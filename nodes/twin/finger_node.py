@@ -228,6 +228,8 @@ class TwinFingerNode(Node):
         Raises FingerPathError if the finger cannot follow the path; the current motion then
         continues.
         """
+        if problem := path.find_problem():
+            raise FingerPathError(f"path: {problem}")
         now_ns = self.clock.now_ns()
         if self.coupled is not None and self.edges:
             self.coupled.advance(self._seconds(now_ns), self.edges)
