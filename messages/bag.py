@@ -673,8 +673,9 @@ class BagReader:
         # Decompression and parsing raise unspecified errors on damaged bytes.
         except Exception as error:
             raise BagError(
-                f"{self.path}: damaged chunk at byte {chunk.offset}; `flexsheet bag recover` saves "
-                "the other chunks"
+                f"{self.path}: damaged chunk at byte {chunk.offset}: "
+                f"{str(error) or type(error).__name__}; `flexsheet bag recover` saves the other "
+                "chunks"
             ) from error
 
     def _check_topics(self) -> None:

@@ -111,7 +111,7 @@ async def test_each_host_reports_its_state_and_its_nodes(tmp_path: Path) -> None
             "both hosts, and the restart",
         )
         await until(
-            lambda: all(one.cpu is not None for one in newest.values()),
+            lambda: all(one.cpu is not None and one.cpu.node for one in newest.values()),
             "how long nodes wait for a processor",
         )
         subscriber.close()

@@ -41,6 +41,7 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     content = load_values()
     content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
     content["object"]["world_from_object"]["position_m"] = [0.0, 0.0, -0.02]
+    content["working_range"]["push_depth_m"] = 0.03
     path = tmp_path / "small.yaml"
     YAML().dump(content, path)
     return path
