@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from flexsheet.launch.commands.doctor_hosts import check_hosts, find_host
+from flexsheet.launch.commands.graph import describe_launch
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.health import probe as probe_module
 from flexsheet.launch.health.doctor_hosts import (
@@ -31,6 +32,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import MAIN, ResolvedGraph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.keys import KEYS_VARIABLE, secret_file
+from flexsheet.launch.running.runs import HOST_FILE, Run
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bus import Publisher
 from flexsheet.messages.security import make_key_pair, write_secret
@@ -154,6 +156,22 @@ def test_a_host_with_other_code_may_report_topics_unknown_here(
         "arm_left_bridge", port("a_topic_of_tomorrow", 50.0), note="well"
     )
     assert "failed" not in {one.state for one in evaluate_probes(three, "main", probes)}
+
+
+def test_a_port_that_is_not_connected_needs_no_messages(three: ResolvedGraph) -> None:
+    (frame,) = (one for one in three.nodes["triangulator"].inputs if one.topic == "frame")
+    assert frame.endpoints == ()
+    probes = good(three)
+    status = make_status("triangulator", port("fingertip", 60.0), inputs=(port("frame", 0.0),))
+    probes["main"].nodes["triangulator"] = status
+    assert bad(evaluate_probes(three, "main", probes)) == []
+
+
+def test_runs_of_several_hosts_are_named_by_host(tmp_path: Path) -> None:
+    run = Run("run", tmp_path)
+    assert describe_launch(run) == "starting"
+    (tmp_path / HOST_FILE).write_text("left")
+    assert describe_launch(run) == "starting, host left"
 
 
 def changed(probe: HostProbe, **values: Any) -> None:

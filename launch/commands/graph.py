@@ -43,8 +43,12 @@ class SeveralGraphsError(CommandError):
 
 
 def describe_launch(run: Run) -> str:
-    """Return the launch file of a run, or "starting" if the run has no plan yet."""
-    return run.launch_file or "starting"
+    """Return the launch file of a run, or "starting" if the run has no plan yet.
+
+    If the run contains the nodes of one host, the host is added.
+    """
+    host = "" if run.host is None else f", host {run.host}"
+    return f"{run.launch_file or 'starting'}{host}"
 
 
 def choose_run(directory: Path | None) -> Path | None:
@@ -113,7 +117,7 @@ def list_readers(plan: ResolvedGraph, topic: str) -> list[str]:
     return [
         node.name
         for node in plan.nodes.values()
-        if any(port.topic == topic for port in node.inputs)
+        if any(port.topic == topic and port.endpoints for port in node.inputs)
     ]
 
 

@@ -155,7 +155,7 @@ def evaluate_probes(
         if len(plan.hosts) > 1:
             found.append(_check_clocks(plan, probe, probes))
         found.append(_check_nodes(plan, probe))
-        found.append(_check_rates(probe))
+        found.append(_check_rates(plan, probe))
         found += _check_devices(plan.nodes_on(host), probe)
         found += check_apparatus(probe, plan.nodes_on(host), plan.scene_message())
         found += _check_resources(probe)
@@ -358,12 +358,21 @@ def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     return finding("ok", f"{len(nodes)} nodes are ready")
 
 
-def _check_rates(probe: HostProbe) -> HostFinding:
+def _check_rates(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     odd, right, refused = [], 0, []
+    # Nodes report the ports that their scene does not need, too; these have no endpoints.
+    unconnected = {
+        (node.name, port.topic)
+        for node in plan.nodes.values()
+        for port in (*node.inputs, *node.outputs)
+        if not port.endpoints
+    }
     for name, status in probe.nodes.items():
         ports = [(one, "publishes") for one in status.outputs]
         ports += [(one, "receives") for one in status.inputs]
         for port, verb in ports:
+            if (name, port.topic) in unconnected:
+                continue
             if port.rejected:
                 refused.append(f"{name} {port.rejected} of {port.topic}")
             wrong = find_rate_problem(port)
