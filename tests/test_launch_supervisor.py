@@ -180,12 +180,12 @@ def test_the_processes_find_node_classes_beside_the_script(
     assert supervisor._own_module_folders(["planner", "elsewhere:Guard"]) == []
 
 
-@pytest.mark.skipif(
-    priority.find_real_time_priority(7) is None, reason="real time is not permitted"
-)
 async def test_real_time_is_withdrawn_step_by_step_while_a_node_gets_no_processor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Another test of this process may have raised its niceness.
+    if priority.find_real_time_priority(7) is None:
+        pytest.skip("real time is not permitted")
     starved = CpuPressure(busy=True, wait_ratio=0.9, node="listener", programs=())
     all_cores = float(os.cpu_count() or 1)
     pressure, used_cores = starved.model_copy(update={"wait_ratio": 0.5}), all_cores
@@ -212,6 +212,9 @@ async def test_real_time_is_withdrawn_step_by_step_while_a_node_gets_no_processo
     async with RunningGraph(plan, report=report) as graph:
         await graph.wait_ready()
         pids = graph.pids["beacon"], graph.pids["image"]
+        await until(
+            lambda: {os.sched_getscheduler(pid) for pid in pids} == {os.SCHED_RR}, "real time"
+        )
         await until(lambda: len(measured) > 1, "two measurements")
         pressure, used_cores, before = starved, 0.1, len(measured)
         await until(lambda: len(measured) > before + 1, "two measurements")
