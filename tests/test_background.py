@@ -79,6 +79,7 @@ class RefusingAutogroup:
 
 def enter_background_beside(error: OSError) -> tuple[int, int]:
     """Enter the background while the kernel refuses the niceness of the session."""
+    # The type is ignored, because a Path that refuses writes even of root does not exist.
     background.AUTOGROUP = RefusingAutogroup(error)  # type: ignore[assignment]
     background.AUTOGROUP_WAIT_S = 0.0
     enter_background()

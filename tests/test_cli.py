@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from flexsheet import read_topic, running_graph
+from flexsheet.launch.commands import launching
 from flexsheet.launch.commands.scene import keys
 from flexsheet.launch.commands.session import describe_node, describe_output, explain_counts
 from flexsheet.launch.experiments.run import DEMO_FILE
@@ -637,12 +638,18 @@ def test_fields_of_a_bag_are_plotted(flexsheet: Command, recorded: Path, tmp_pat
     assert (printed.code, 'did you mean "position_world_m"?' in printed.err) == (2, True)
 
 
-def test_a_node_that_is_omitted_must_exist(flexsheet: Command) -> None:
+def test_a_node_that_is_omitted_must_exist(
+    flexsheet: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables: dict[tuple[str, ...], list[tuple[Any, ...]]] = {}
+    monkeypatch.setattr(launching, "print_table", tables.__setitem__)
     printed = flexsheet("launch", "demo", "--without", "planer", "--dry-run")
     assert (printed.code, 'did you mean "planner"?' in printed.err) == (2, True)
     printed = flexsheet("launch", "demo", "--without", "planner", "--dry-run")
     assert printed.code == 0
-    assert not [line for line in printed.out.splitlines() if line.startswith("planner ")]
+    (nodes,) = (rows for columns, rows in tables.items() if columns[0] == "node")
+    names = {row[0] for row in nodes}
+    assert names == load_graph(DEMO_FILE).nodes.keys() - {"planner"}
 
 
 def test_a_node_runs_alone_and_a_graph_is_stopped(tmp_path: Path, runs_root: Path) -> None:

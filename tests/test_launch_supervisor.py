@@ -183,9 +183,9 @@ def test_the_processes_find_node_classes_beside_the_script(
 async def test_real_time_is_withdrawn_step_by_step_while_a_node_gets_no_processor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Another test of this process may have raised its niceness.
+    # Checked at run time, because an earlier test of this process may have raised its niceness.
     if priority.find_real_time_priority(7) is None:
-        pytest.skip("real time is not permitted")
+        pytest.skip("the user, or a positive niceness of this process, permits no real time")
     starved = CpuPressure(busy=True, wait_ratio=0.9, node="listener", programs=())
     all_cores = float(os.cpu_count() or 1)
     pressure, used_cores = starved.model_copy(update={"wait_ratio": 0.5}), all_cores

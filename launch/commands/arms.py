@@ -302,18 +302,12 @@ class _Arms:
         from flexsheet.messages.types import Status
 
         if isinstance(message, Status):
-            side = (
-                self._plan.nodes[message.node].arm_side
-                if message.node in self._plan.nodes
-                else None
-            )
-            if side is not None:
-                self.notes[side] = message.last_error or message.note
+            node = self._plan.nodes.get(message.node)
+            if node is not None and node.arm_side is not None:
+                self.notes[node.arm_side] = message.last_error or message.note
         else:
-            self._on_state(message)
-
-    def _on_state(self, state: ArmState) -> None:
-        self.states[state.side], self._received_s[state.side] = state, self._loop.time()
+            self.states[message.side] = message
+            self._received_s[message.side] = self._loop.time()
 
     async def publish(self, topic: str, message: Message) -> None:
         """Wait until subscribers have connected, then publish a message once."""

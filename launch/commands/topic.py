@@ -278,11 +278,11 @@ def pub(
     Subscribers that connect later receive a message of a latched topic only while this command
     runs.
     """
-    from flexsheet.launch.running.tools import check_writable
+    from flexsheet.launch.running.tools import find_tool_writer
     from flexsheet.messages.topics import find_topic
 
     found, run = find_topic(topic), choose_run(run)
-    check_writable(*running_graph(run), found.name)
+    find_tool_writer(*running_graph(run), found.name)  # before errors in the message's fields
     built = _parse_message(found, message)
     times = 1 if once or (rate is None and count is None) else count
     sent = 0

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from flexsheet.launch.plans.plan_model import MAIN, ResolvedGraph, tools_on
+from flexsheet.launch.plans.plan_model import MAIN, ResolvedGraph, Writer, tools_on
 from flexsheet.launch.running.runs import Run, local_endpoints, local_sources, ring_file
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Handler, Problem, Publisher, Subscriber
@@ -129,11 +129,16 @@ async def read_topic(
         subscriber.close()
 
 
-def check_writable(plan: ResolvedGraph, run: Run, topic: str) -> None:
-    """Raise BadInputError if tools on this host are not allowed to write a topic."""
+def find_tool_writer(plan: ResolvedGraph, run: Run, topic: str) -> Writer:
+    """Return the writer of a topic that stands for the tools on this host.
+
+    Raises BadInputError if tools on this host are not allowed to write the topic.
+    """
     host = tools_host(run)
-    if plan.writer(topic, tools_on(host)) is None:
+    writer = plan.writer(topic, tools_on(host))
+    if writer is None:
         raise _make_refusal(plan, topic, host)
+    return writer
 
 
 class GraphWriter:
@@ -151,12 +156,10 @@ class GraphWriter:
         keys = load_tool_keys(plan, run)
         self._sequences: dict[str, int] = {}
         self._publishers: dict[str, Publisher] = {}
-        self._name, host = tools_on(tools_host(run)), tools_host(run)
+        self._name = tools_on(tools_host(run))
         try:
             for name in topics:
-                writer = plan.writer(name, self._name)
-                if writer is None:
-                    raise _make_refusal(plan, name, host)
+                writer = find_tool_writer(plan, run, name)
                 endpoints = local_endpoints(run, writer.endpoints)
                 self._publishers[name] = Publisher(find_topic(name), endpoints, keys=keys)
         except BaseException:
