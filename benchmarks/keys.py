@@ -50,7 +50,7 @@ def listen(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> 
             if not arrived(header.sequence, header.publish_ns) and not ended.done():
                 ended.set_result(None)
 
-        keys = KeyRing(Path(os.environ[RING_VARIABLE]))
+        keys = KeyRing.load(Path(os.environ[RING_VARIABLE]))
         source = Source(endpoint, "bench", "main")
         subscriber = Subscriber(topic, [source], on_message, PortCounts(), keys=keys)
         subscriber.start()
@@ -98,7 +98,7 @@ def create_two_rings(folder: Path) -> Iterator[KeyRing]:
             public=public,
         )
     os.environ[RING_VARIABLE] = str(folder / "left.json")
-    yield KeyRing(folder / "main.json")
+    yield KeyRing.load(folder / "main.json")
     del os.environ[RING_VARIABLE]
 
 

@@ -27,7 +27,6 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -36,11 +35,10 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.connection_guard import ConnectionGuard
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.local_bus import LocalBus, LocalConnection
 from flexsheet.messages.notes import NodeNote
-from flexsheet.messages.security import KeyChange, KeyRing, ZapAuthenticator
+from flexsheet.messages.security import KeyRing, ZapAuthenticator
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
 
@@ -176,8 +174,7 @@ class Publisher:
     bind: endpoints, "ipc:///path" or "tcp://address:port". "tcp://127.0.0.1:*" selects a free port.
     keys: keys of the hosts that may connect over tcp. If None, tcp is bound to the loopback
         interface.
-    on_refused: function that is called with a text for each refused or closed connection. If no
-        event loop is running, a separate thread calls the function.
+    on_refused: function that is called with a text for each refused connection.
     local: bus that passes messages to subscribers in this process without encoding them. The socket
         is then used only while another process has subscribed.
     """
@@ -197,9 +194,7 @@ class Publisher:
         self._has_remote_readers = False
         self._last: list[Any] | None = None
         self._latched = topic.delivery is Delivery.LATCHED
-        self._by_tcp = any(one.startswith("tcp:") for one in bind)
-        self._keys = keys if self._by_tcp else None
-        self._on_refused = on_refused
+        self._keys = keys if any(one.startswith("tcp:") for one in bind) else None
         self._domain: bytes | None = None
         if self._keys is not None:
             self._domain = ZapAuthenticator.register(self._keys, on_refused)
@@ -219,8 +214,6 @@ class Publisher:
         try:
             if self._latched:
                 self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
-            if self._by_tcp:
-                ConnectionGuard.watch(self._socket, self._on_closed_by_guard)
             # Endpoints that are bound before the keys are set need no key, so ipc endpoints are
             # bound first.
             for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
@@ -231,19 +224,12 @@ class Publisher:
                         self._keys.set_server_keys(self._socket, self._domain)
                 endpoints.append(_bind(self._socket, self.topic, endpoint, keys=self._keys))
         except BaseException:
-            self._socket.disable_monitor()
             self._socket.close(linger=0)
             raise
         self.endpoints = endpoints
         if self._loop is not None:
             self._loop.add_reader(self._socket.fileno(), self._serve_late_subscribers)
             self._loop.call_soon(self._serve_late_subscribers)
-
-    def renew_keys(self, change: KeyChange) -> None:
-        """Reopen the socket with the new keys if the key of any host has changed."""
-        if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
-            self._close_socket(unbind=True)
-            self._open(self.endpoints)
 
     def interrupt(self) -> None:
         """Disconnect all subscribers, as if this process had ended.
@@ -311,16 +297,6 @@ class Publisher:
         if not drained and not self._loop.is_closed():
             self._loop.call_soon(self._serve_late_subscribers)
 
-    def _on_closed_by_guard(self, address: str, reason: str) -> None:
-        """Report a closed connection. The thread of the connection guard calls this method."""
-        text = f'topic "{self.topic.name}": a connection from {address} was closed: {reason}'
-        if self._loop is None:
-            self._on_refused(text)
-            return
-        # After the end of the event loop there is no handler left to report to.
-        with suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._on_refused, text)
-
     def forget(self) -> None:
         """Discard the message that is stored for late subscribers."""
         self._last = None
@@ -348,7 +324,6 @@ class Publisher:
         if unbind:
             for endpoint in self.endpoints:
                 self._socket.unbind(endpoint)
-        self._socket.disable_monitor()
         self._socket.close(linger=LINGER_MS)
 
     def _unregister_keys(self) -> None:
@@ -449,21 +424,6 @@ class Subscriber:
         """Disconnect from all endpoints. The message handler may call this method."""
         for connection in self._connections:
             connection.close()
-
-    def renew_keys(self, change: KeyChange) -> None:
-        """Reconnect to the hosts whose keys have changed.
-
-        If the key of this host has changed, reconnect to all hosts.
-        """
-        for connection in self._connections:
-            if (
-                isinstance(connection, _HostConnection)
-                and connection.secured
-                and not connection.closed
-                and (change.own or connection.host in change.hosts)
-            ):
-                connection.close()
-                connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
         """Decode and check the header of a message, and count messages that were lost before it.
@@ -831,9 +791,8 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         options[zmq.MAXMSGSIZE] = topic.max_bytes + MAX_EXCESS_BYTES
         options |= TCP_KEEPALIVE_OPTIONS
     else:
-        # A publisher receives only subscriptions and handshakes. `ConnectionGuard` bounds their
-        # total, so the queue needs no limit. If a queue is full when its sender disconnects, libzmq
-        # 4.3.5 aborts the process at the next heartbeat.
+        # A publisher receives only subscriptions and handshakes. If a queue is full when its sender
+        # disconnects, libzmq 4.3.5 aborts the process at the next heartbeat, so it has no limit.
         options[zmq.MAXMSGSIZE] = MAX_SUBSCRIPTION_BYTES
         options[zmq.RCVHWM] = 0
     for option, value in options.items():

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar, Self
 
 import zmq
 from zmq.utils import z85
@@ -138,53 +138,26 @@ def read_secret(path: Path) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class KeyChange:
-    """The result of a reload of the key ring: the hosts whose keys have changed.
-
-    own: whether the key of this host has changed.
-    hosts: names of the other hosts with changed keys.
-    """
-
-    own: bool
-    hosts: frozenset[str]
-
-
 class KeyRing:
-    """The key pair of this host, and the public keys of all hosts.
+    """The key pair of a host, and the public keys of all hosts by name."""
 
-    file: JSON file with {"host", "secret_file", "public": {host: key}}, written by `write_ring`.
+    public_key: str
+    secret_key: str
+    public: dict[str, str]
 
-    Raises SecurityError if the JSON file or the file with the secret key is invalid.
-    """
+    @classmethod
+    def load(cls, file: Path) -> Self:
+        """Load a key ring from a JSON file that `write_ring` has written.
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._stamps: tuple[Any, ...] = ()
-        self.host, self.public_key, self.secret_key = "", "", ""
-        self.public: dict[str, str] = {}
-        self._host_by_key: dict[str, str] = {}
-        self.reload()
-
-    def find_host(self, key: str) -> str | None:
-        """Return the name of the host that has a public key, or None if no host has this key."""
-        return self._host_by_key.get(key)
-
-    def reload(self) -> KeyChange | None:
-        """Read the key files again, and return the changes.
-
-        Return None if the files have not changed. Raises SecurityError if a file is invalid. In
-        this case, the keys in memory remain unchanged.
+        Raises SecurityError if the JSON file or the file with the secret key is invalid.
         """
         try:
-            ring = json.loads(self._file.read_text())
+            ring = json.loads(file.read_text())
             host, secret_file, public = ring["host"], Path(ring["secret_file"]), ring["public"]
-            stamps = (_stamp(self._file), _stamp(secret_file))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise SecurityError(
-                f"{self._file}: does not contain valid keys: {error}; start the graph again"
+                f"{file}: does not contain valid keys: {error}; start the graph again"
             ) from error
-        if stamps == self._stamps:
-            return None
         secret = read_secret(secret_file)
         own = derive_public_key(secret)
         if public.get(host) != own:
@@ -193,16 +166,11 @@ class KeyRing:
                 f"expected {public.get(host)}, found {own}; write the found key into the launch "
                 "file with flexsheet keys install"
             )
-        before = self.public
-        change = KeyChange(
-            own=bool(self.secret_key) and own != self.public_key,
-            hosts=frozenset(name for name, key in before.items() if public.get(name) != key),
-        )
-        self.host, self.secret_key, self.public_key = host, secret, own
-        self.public = dict(public)
-        self._host_by_key = {key: name for name, key in self.public.items()}
-        self._stamps = stamps
-        return change
+        return cls(own, secret, public)
+
+    def find_host(self, key: str) -> str | None:
+        """Return the name of the host that has a public key, or None if no host has this key."""
+        return next((name for name, one in self.public.items() if one == key), None)
 
     def set_server_keys(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
         """Set the keys of a server socket, so that its peers must have a key of this ring.
@@ -233,7 +201,7 @@ class KeyRing:
 
 
 def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, str]) -> None:
-    """Write the JSON file that `KeyRing` reads. The file is replaced atomically."""
+    """Write the JSON file that `KeyRing.load` reads. The file is replaced atomically."""
     text = json.dumps({"host": host, "secret_file": str(secret_file), "public": public})
     write_file(file, text)
 
@@ -312,12 +280,3 @@ class ZapAuthenticator:
             )
             return [ZAP_VERSION, number, b"400", b"not a host of the plan", b"", b""]
         return [ZAP_VERSION, number, b"200", b"OK", host.encode(), b""]
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return a file's modification time (ns), inode and size (bytes), or None if it is missing."""
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return None
-    return status.st_mtime_ns, status.st_ino, status.st_size

@@ -31,7 +31,7 @@ from flexsheet.messages.bus import BusError, MessageFilter, Publisher, Source, S
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.notes import NodeNote
-from flexsheet.messages.security import KeyRing, SecurityError
+from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
 from flexsheet.nodes import node_class
@@ -43,7 +43,6 @@ from flexsheet.nodes.stop_socket import StopSocket
 
 STATUS_PERIOD_S = 1.0
 CANCEL_AGAIN_S = 0.2
-KEYS_PERIOD_S = 1.0
 
 
 class PortConfig(BaseModel):
@@ -105,10 +104,9 @@ class NodeTransport:
 
     def __init__(self, config: NodeConfig, log: Any, local: LocalBus | None = None) -> None:
         self._config, self._log, self._local = config, log, local
-        self.keys = None if config.keys_file is None else KeyRing(config.keys_file)
+        self._keys = None if config.keys_file is None else KeyRing.load(config.keys_file)
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: list[Subscriber] = []
-        self._keys_problem = ""
         self._stop_socket: StopSocket | None = None
         self._failure: BusError | None = None
         self._has_failed = asyncio.Event()
@@ -122,7 +120,7 @@ class NodeTransport:
                 self._publishers[topic.name] = Publisher(
                     topic,
                     endpoints,
-                    keys=self.keys,
+                    keys=self._keys,
                     on_refused=on_refused,
                     local=self._local,
                 )
@@ -157,7 +155,7 @@ class NodeTransport:
                 node_input.counts,
                 on_problem=partial(self._report_problem, node),
                 raw=node.takes_frames,
-                keys=self.keys,
+                keys=self._keys,
                 # The status of nodes with another plan must be accepted.
                 plan=None
                 if node_input.topic.message in (Status, HostStatus)
@@ -227,24 +225,6 @@ class NodeTransport:
 
         return rejection_reason
 
-    def renew_keys(self) -> None:
-        """Reload the encryption keys if they have changed, and reconnect the affected sockets."""
-        if self.keys is None:
-            return
-        try:
-            change = self.keys.reload()
-        except SecurityError as error:
-            if str(error) != self._keys_problem:
-                self._keys_problem = str(error)
-                self._log.error("keys", problem=self._keys_problem)
-            return
-        if change is not None:
-            self._keys_problem = ""
-            for publisher in self._publishers.values():
-                publisher.renew_keys(change)
-            for subscriber in self._subscribers:
-                subscriber.renew_keys(change)
-
     def send(self, topic: Topic, message: Message, header: Header) -> None:
         publisher = self._publishers.get(topic.name)
         if publisher is not None:
@@ -271,13 +251,6 @@ async def run_timer(node: Node, number: int, timer: Timer) -> None:
         if due_s <= now_s:
             due_s += period_s * int((now_s - due_s) / period_s + 1)
         await asyncio.sleep(due_s - now_s)
-
-
-async def run_key_reload(transport: NodeTransport) -> None:
-    """Check once a second whether the encryption keys have changed, and reload changed keys."""
-    while True:
-        await asyncio.sleep(KEYS_PERIOD_S)
-        transport.renew_keys()
 
 
 async def run_status(node: Node, process: psutil.Process, beat: Callable[[], None]) -> None:
@@ -362,8 +335,6 @@ async def run_node(
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
         tasks.append(asyncio.create_task(stop.wait()))
         tasks.append(asyncio.create_task(transport.watch_failure()))
-        if transport.keys is not None:
-            tasks.append(asyncio.create_task(run_key_reload(transport)))
         # Exclude the objects that `setup` has made from garbage collection while the node runs.
         gc.collect()
         gc.freeze()

@@ -50,7 +50,7 @@ class Hosts:
         return file
 
     def ring(self, name: str) -> KeyRing:
-        return KeyRing(self.write_ring(name))
+        return KeyRing.load(self.write_ring(name))
 
 
 @contextmanager

@@ -222,13 +222,13 @@ async def listen(ring: Path, endpoint: str, record: Path) -> None:
             file.write(f"{header.epoch} {header.sequence}\n")
 
         source = Source(endpoint, "writer", "main")
-        Subscriber(FINGER, [source], receive, PortCounts(), keys=KeyRing(ring)).start()
+        Subscriber(FINGER, [source], receive, PortCounts(), keys=KeyRing.load(ring)).start()
         await asyncio.Event().wait()
 
 
 async def publish_until(ring: Path, endpoint: str, epoch: int) -> None:
     """Publish messages at 100 Hz."""
-    publisher, number = Publisher(FINGER, [endpoint], keys=KeyRing(ring)), 0
+    publisher, number = Publisher(FINGER, [endpoint], keys=KeyRing.load(ring)), 0
     while True:
         number += 1
         publisher.send(finger(0.0), header(number, epoch=epoch))

@@ -618,3 +618,14 @@ async def test_an_interrupted_publisher_disconnects_its_readers_and_goes_on(
     assert messages == ["stop 1", "stop 2", "stop 3"]
     assert seen.index("end") == 1
     assert counts == PortCounts()
+
+
+async def test_latched_messages_reach_late_subscribers_by_tcp_and_ipc(
+    connections: Connections,
+) -> None:
+    publisher = connections.sender(TOPICS["estop"], connections.endpoint(), "tcp://127.0.0.1:*")
+    publisher.send(stop("before"), header(1))
+    for endpoint in publisher.endpoints:
+        receiver = connections.receiver(TOPICS["estop"], endpoint)
+        await until(lambda receiver=receiver: receiver.inbox)
+        assert receiver.sequences == [1]

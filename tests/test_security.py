@@ -7,6 +7,7 @@ import itertools
 import random
 import re
 import socket
+import struct
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
@@ -23,7 +24,7 @@ import pytest_asyncio
 from flexsheet.messages import bus
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import BusError, Publisher, Source, Subscriber
-from flexsheet.messages.security import KeyChange, KeyRing, SecurityError
+from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, SheetTarget
 from flexsheet.messages.wire import encode
@@ -150,49 +151,6 @@ async def test_only_the_host_of_the_plan_is_accepted(
     await secured.publish_until(right, lambda: receiver.inbox)
 
 
-async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(
-    secured: SecuredPublisher,
-) -> None:
-    sender, receiver = secured.sender(), secured.receiver(secured.rings["left"])
-    subscriber = receiver.subscriber
-    await secured.publish_until(sender, lambda: receiver.inbox)
-    secured.known.public["left"] = secured.known.make_key("left")
-    for name in ("main", "left"):
-        secured.known.write_ring(name)
-    change = secured.rings["main"].reload()
-    assert change == KeyChange(own=False, hosts=frozenset({"left"}))
-    sender.renew_keys(change)
-    receiver.inbox.clear()
-    await secured.publish_until(sender, lambda: receiver.problems)
-    assert receiver.inbox == [], "the old key is refused, also on the connection that was there"
-    change = secured.rings["left"].reload()
-    assert change == KeyChange(own=True, hosts=frozenset({"left"}))
-    subscriber.renew_keys(change)
-    await secured.publish_until(sender, lambda: receiver.inbox)
-    secured.known.public["main"] = secured.known.make_key("main")
-    for name in ("main", "left"):
-        secured.known.write_ring(name)
-        changed = secured.rings[name].reload()
-        assert changed is not None
-        (sender if name == "main" else subscriber).renew_keys(changed)
-    receiver.inbox.clear()
-    await secured.publish_until(sender, lambda: receiver.inbox)
-    assert secured.rings["main"].reload() is None
-
-
-async def test_an_added_host_disturbs_no_connection(secured: SecuredPublisher) -> None:
-    sender, receiver = secured.sender(), secured.receiver(secured.rings["left"])
-    await secured.publish_until(sender, lambda: receiver.inbox)
-    secured.known.public["right"] = secured.known.derive_public_key("stranger")
-    secured.known.write_ring("main")
-    change = secured.rings["main"].reload()
-    assert change == KeyChange(own=False, hosts=frozenset())
-    sender.renew_keys(change)
-    late = secured.receiver(secured.rings["stranger"])
-    await secured.publish_until(sender, lambda: late.inbox)
-    assert receiver.sequences == list(range(receiver.sequences[0], receiver.sequences[-1] + 1))
-
-
 async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(
     secured: SecuredPublisher,
 ) -> None:
@@ -307,6 +265,25 @@ async def test_a_recorded_connection_cannot_be_replayed(secured: SecuredPublishe
     writer.close()
     # Greeting (64 bytes) and WELCOME (170 bytes in a frame) at most: no message.
     assert len(answer) < 300
+
+
+async def test_a_subscription_that_is_too_long_ends_the_connection(
+    secured: SecuredPublisher,
+) -> None:
+    publisher = Publisher(FINGER, ["tcp://127.0.0.1:*"])
+    secured.cleanups.append(publisher.close)
+    reader, writer = await asyncio.open_connection(
+        "127.0.0.1", int(publisher.endpoints[0].rpartition(":")[2])
+    )
+    greeting = struct.pack("<B8xBBB20sB31x", 0xFF, 0x7F, 3, 1, b"NULL", 0)
+    ready = b"\x05READY\x0bSocket-Type" + struct.pack(">I", 3) + b"SUB"
+    writer.write(greeting + struct.pack(">BB", 4, len(ready)) + ready)
+    size = bus.MAX_SUBSCRIPTION_BYTES + 1
+    writer.write(struct.pack(">BQ", 2, size) + b"\x01".ljust(size, b"x"))
+    with suppress(ConnectionResetError):
+        while await reader.read(1000):
+            pass
+    writer.close()
 
 
 async def test_messages_of_250_mib_are_counted_and_others_continue(

@@ -174,7 +174,7 @@ async def check_hosts(
         if plan.keys and key_problem is None:
             file = Path(folder) / "ring.json"
             write_ring(file, host=here, secret_file=secret_file(here), public=plan.keys)
-            keys = KeyRing(file)
+            keys = KeyRing.load(file)
         probes = await probe_all(plan, here=here, keys=keys, run=run, timeout_s=timeout_s)
     findings = evaluate_probes(plan, here, probes)
     if probes[here].status is None:

@@ -109,7 +109,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.KEY_REJECTED: (
         "keys",
         "the host rejects the key of {here}: its launch file has no key or another key for {here}",
-        "copy {file} from here to {host}; its launcher reloads it automatically",
+        "copy {file} from here to {host}, and start its launcher again",
     ),
     Reachability.UNENCRYPTED: (
         "keys",
@@ -275,7 +275,7 @@ def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     other = [name for name in names if theirs.get(name) != plan.keys.get(name)]
     if other:
         what = f"the host's keys differ from this launch file for {', '.join(other)}"
-        remedy = f"copy {plan.launch_file} to {probe.host}; its launcher reloads it automatically"
+        remedy = f"copy {plan.launch_file} to {probe.host}, and start its launcher again"
         return HostFinding(probe.host, "keys", "failed", what, remedy)
     what = f"the host accepts the same keys as this computer: {', '.join(names)}"
     return HostFinding(probe.host, "keys", "ok", what)

@@ -6,10 +6,9 @@ The module also defines the names of nodes and topic writers that exist once per
 from __future__ import annotations
 
 import ipaddress
-from pathlib import Path
 
-from flexsheet.launch.plans.documents import Document, Key, validate
-from flexsheet.launch.plans.launch_file import HostSpec, LaunchFile, read_launch_file
+from flexsheet.launch.plans.documents import Document, Key
+from flexsheet.launch.plans.launch_file import HostSpec
 from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN
 from flexsheet.messages.security import is_key
 
@@ -70,18 +69,6 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
                 f'the same key belongs to host "{host_by_key[host.key]}"',
                 "create a separate key for each host",
             )
-
-
-def load_keys(path: Path) -> dict[str, str]:
-    """Read the public key of each host from a launch file.
-
-    Raises BadInputError if the launch file is invalid.
-    """
-    document = read_launch_file(path)
-    spec = validate(LaunchFile, document)
-    check_hosts(spec.hosts, document)
-    document.raise_problems()
-    return {name: host.key for name, host in spec.hosts.items() if host.key is not None}
 
 
 def launcher_on(host: str) -> str:

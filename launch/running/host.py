@@ -31,7 +31,7 @@ from flexsheet.messages.busy import describe_busy, describe_busy_remedy, is_busy
 from flexsheet.messages.clock import Clock, SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.notes import NodeNote
-from flexsheet.messages.security import KeyChange, KeyRing
+from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import (
     ArmState,
@@ -173,13 +173,6 @@ class HostAgent:
         )
         subscriber.start()
         return subscriber
-
-    def renew_keys(self, change: KeyChange) -> None:
-        """Replace the keys of all sockets by the newly loaded keys."""
-        for publisher in self.publishers.values():
-            publisher.renew_keys(change)
-        for subscriber in self._subscribers:
-            subscriber.renew_keys(change)
 
     async def close(self) -> None:
         """Stop publishing, and close all sockets. Further calls have no effect."""

@@ -16,11 +16,10 @@ from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean, read_document
-from flexsheet.launch.plans.hosts import load_keys
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.runs import Run, ring_file
 from flexsheet.messages.files import write_file
-from flexsheet.messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
+from flexsheet.messages.security import KeyRing, SecurityError, is_key, write_ring
 
 KEYS_VARIABLE = "FLEXSHEET_KEYS"
 """The environment variable that replaces the default folder of secret keys."""
@@ -52,41 +51,12 @@ def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Key
         file = ring_file(run, name)
         write_ring(file, host=name, secret_file=secret_file(name), public=plan.keys)
         try:
-            rings[name] = KeyRing(file)
+            rings[name] = KeyRing.load(file)
         except SecurityError as error:
             problems.append(Problem(plan.launch_file, ("hosts", name, "key"), str(error)))
     if problems:
         raise BadInputError(problems)
     return rings
-
-
-class KeyWatch:
-    """A monitor that detects key changes during a run.
-
-    The monitor reads the launch file and the secret key files, and updates the key ring files of
-    the run's processes.
-    """
-
-    def __init__(self, plan: ResolvedGraph, run: Run, rings: dict[str, KeyRing]) -> None:
-        self._launch_file, self._run, self._rings = Path(plan.launch_file), run, rings
-        self._public = plan.keys
-        self._read_ns = 0
-
-    def read_changes(self) -> dict[str, KeyChange]:
-        """Update the key ring files, and return the key changes of each host since the last call.
-
-        Raises BadInputError, SecurityError or OSError if a file cannot be read or is invalid.
-        """
-        changed_ns = self._launch_file.stat().st_mtime_ns
-        if changed_ns != self._read_ns:
-            public = load_keys(self._launch_file)
-            if public != self._public:
-                for name in self._rings:
-                    file = ring_file(self._run, name)
-                    write_ring(file, host=name, secret_file=secret_file(name), public=public)
-            self._public, self._read_ns = public, changed_ns
-        changes = {name: ring.reload() for name, ring in self._rings.items()}
-        return {name: change for name, change in changes.items() if change is not None}
 
 
 def install(launch_file: Path, host: str, key: str) -> None:

@@ -45,7 +45,7 @@ from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PAR
 from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.launch.running.fork_server import NODE_ARGUMENTS, ForkServer
 from flexsheet.launch.running.host import HostAgent, make_output
-from flexsheet.launch.running.keys import KeyWatch, make_rings
+from flexsheet.launch.running.keys import make_rings
 from flexsheet.launch.running.priority import (
     describe_priority_problem,
     find_real_time_priority,
@@ -71,7 +71,7 @@ from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.security import KeyRing, SecurityError
+from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
 from flexsheet.nodes import NodeRole
@@ -80,7 +80,6 @@ from flexsheet.nodes.runner import NodeConfig, PortConfig, ProcessConfig
 
 SOFTWARE = Path(__file__).resolve().parents[2]
 STOP_GRACE_S = 3.0
-KEYS_PERIOD_S = 1.0
 LIVENESS_PERIOD_S = 0.5
 STACK_DUMP_S = 0.5
 """The time (s) for which a hanging node can log its call stacks before SIGKILL ends it."""
@@ -367,7 +366,6 @@ class RunningGraph:
         self._epoch_ns = 0
         self._agents: dict[str, HostAgent] = {}
         self._rings: dict[str, KeyRing] = {}
-        self._keys_watch: asyncio.Task[None] | None = None
         self._lifeline: tuple[int, int] | None = None
         self._fork_server: ForkServer | None = None
         self._stopping = False
@@ -503,11 +501,10 @@ class RunningGraph:
         This method can be called twice.
         """
         self._stopping = True
-        watches = [] if self._keys_watch is None else [self._keys_watch]
-        for task in (*self._supervisors.values(), *watches):
+        for task in self._supervisors.values():
             task.cancel()
         try:
-            await asyncio.gather(*self._supervisors.values(), *watches, return_exceptions=True)
+            await asyncio.gather(*self._supervisors.values(), return_exceptions=True)
             await self._end_children()
         finally:
             for child in self._children.values():
@@ -572,7 +569,6 @@ class RunningGraph:
         _check_ports(self.plan, self._host, self._port_options)
         if self.plan.keys:
             self._rings = make_rings(self.plan, self.run, self._host)
-            self._keys_watch = asyncio.create_task(self._watch_keys(), name="keys")
         self._write_run_files()
         if self._host in (None, MAIN):
             self._publish_latched("scene", self.plan.scene_message())
@@ -653,28 +649,6 @@ class RunningGraph:
             for node in self.nodes
             if node.host == host
         )
-
-    async def _watch_keys(self) -> None:
-        """Detect changed keys in the launch file and in key files; send them to the processes."""
-        watch = KeyWatch(self.plan, self.run, self._rings)
-        reported = ""
-        while True:
-            await asyncio.sleep(KEYS_PERIOD_S)
-            try:
-                changes = watch.read_changes()
-            except (BadInputError, SecurityError, OSError) as error:
-                if str(error) != reported:
-                    reported = str(error)
-                    self._report(LAUNCHER, f"the keys are not reloaded: {reported}")
-                continue
-            for host, change in changes.items():
-                reported = ""
-                self._report(LAUNCHER, f"the keys of host {host} are reloaded")
-                if host == MAIN:
-                    for publisher in self._publishers.values():
-                        publisher.renew_keys(change)
-                if host in self._agents:
-                    self._agents[host].renew_keys(change)
 
     async def _supervise(self, process: ResolvedProcess) -> None:
         """Run a process, and restart it according to its policy.

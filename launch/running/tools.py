@@ -56,7 +56,7 @@ def list_tool_topics(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
 
 def load_tool_keys(plan: ResolvedGraph, run: Run) -> KeyRing | None:
     """Return the authentication keys of this host, or None if the graph uses no keys."""
-    return KeyRing(ring_file(run, tools_host(run))) if plan.keys else None
+    return KeyRing.load(ring_file(run, tools_host(run))) if plan.keys else None
 
 
 def make_subscriber(
