@@ -29,7 +29,7 @@ FOUND = ("crash", "oom", "timeout")
 MAX_BYTES = 1 << 20
 MODULES = {
     "wire": ("flexsheet.messages.wire", "flexsheet.messages.bus", "flexsheet.messages.arrays"),
-    "bag": ("flexsheet.messages.bag", "flexsheet.messages.migrations", "flexsheet.messages.wire"),
+    "bag": ("flexsheet.messages.bag", "flexsheet.messages.wire"),
     "launch": ("flexsheet.launch.plans.documents", "flexsheet.launch.plans.plan"),
     "scene": (
         "flexsheet.launch.plans.documents",

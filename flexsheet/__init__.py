@@ -6,8 +6,6 @@ A name is imported on first use, because importing all names takes long. The mes
 
 from __future__ import annotations
 
-import sys
-
 # Importing `typing` would lengthen the time in which an interrupt meets Python's own handler.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -48,13 +46,6 @@ _EXPORTS = {
 }
 _MODULES = {name: module for module, names in _EXPORTS.items() for name in names}
 
-_FORMER_NAMES = {
-    "Plan": "ResolvedGraph",
-    "ToolsWriter": "GraphWriter",
-    "load_plan": "load_graph",
-    "topic_named": "find_topic",
-}
-
 __all__ = [
     "TOPICS",
     "BadInputError",
@@ -89,14 +80,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    if name in _FORMER_NAMES:
-        import warnings
-
-        new = _FORMER_NAMES[name]
-        warnings.warn(
-            f"flexsheet.{name} is deprecated; use flexsheet.{new}", DeprecationWarning, stacklevel=2
-        )
-        return getattr(sys.modules[__name__], new)
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

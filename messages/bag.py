@@ -42,9 +42,8 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from flexsheet.messages.base import Header, Message, compute_fingerprint
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import make_write_error
-from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, find_migration
 from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, find_topic
-from flexsheet.messages.wire import PROTOCOL, WireError, encode, read_envelope
+from flexsheet.messages.wire import PROTOCOL, WireError, decode, encode
 
 PROFILE = "flexsheet"
 CHUNK_BYTES = 1 << 20
@@ -314,31 +313,6 @@ class Chunk:
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelDecoder:
-    """A decoder for the messages of one MCAP channel.
-
-    recorded_type, fingerprint: name and hash of the message type at the time of the recording.
-    migrate: function that converts the decoded fields to the current message type.
-    """
-
-    topic: Topic
-    recorded_type: str
-    fingerprint: bytes
-    migrate: Migration
-
-    def decode(self, frames: list[memoryview]) -> tuple[Message, Header]:
-        """Decode a message and convert it to the current message type.
-
-        Raises WireError if the message is invalid.
-        """
-        envelope = read_envelope(
-            frames, self.topic, fingerprint=self.fingerprint, type_name=self.recorded_type
-        )
-        envelope.fields = self.migrate(envelope.fields)
-        return envelope.open(), envelope.header
-
-
-@dataclass(frozen=True, slots=True)
 class TopicInfo:
     """A summary of the messages of one topic in a bag.
 
@@ -409,9 +383,7 @@ class BagReader:
         self.complete = False
         self.problem = ""
         self.metadata: dict[str, dict[str, str]] = {}
-        self._topics = (
-            None if topics is None else frozenset(RENAMED_TOPICS.get(name, name) for name in topics)
-        )
+        self._topics = None if topics is None else frozenset(topics)
         self._start_ns, self._end_ns = start_ns, end_ns
         self.channels: dict[int, mcap_records.Channel] = {}
         self.schemas: dict[int, mcap_records.Schema] = {}
@@ -432,15 +404,14 @@ class BagReader:
     def __iter__(self) -> Iterator[tuple[str, Message, Header, int]]:
         """Yield decoded messages in the order of recording.
 
-        Messages of older types are converted to the current types. Raises BagError for an invalid
-        message, and for a recorded type that cannot be converted.
+        Raises BagError for an invalid message, and for a recorded type that differs from the
+        current type of the topic.
         """
-        decoders = {
-            channel.topic: self._make_decoder(channel) for channel in self._selected().values()
-        }
+        for channel in self._selected().values():
+            self._check_readable(channel)
         for number, (name, frames, log_time_ns) in enumerate(self.frames()):
             try:
-                message, header = decoders[name].decode(frames)
+                message, header = decode(frames, TOPICS[name])
             except WireError as error:
                 raise BagError(
                     f'{self.path}: topic "{name}", message {number} at {log_time_ns} ns: {error}'
@@ -454,8 +425,9 @@ class BagReader:
 
         Raises BagError if the record is invalid.
         """
+        self._check_readable(channel)
         try:
-            return self._make_decoder(channel).decode(split_frames(record.data))
+            return decode(split_frames(record.data), TOPICS[channel.topic])
         except WireError as error:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" at {record.log_time} ns: {error}'
@@ -501,7 +473,7 @@ class BagReader:
     @property
     def topics(self) -> dict[str, str]:
         """Return a mapping from the name of each recorded topic to the name of its message type."""
-        return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
+        return {one.topic: one.metadata.get("type", "") for one in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
         """Return the content of the attachment with the given name.
@@ -532,10 +504,10 @@ class BagReader:
             topics.append(
                 TopicInfo(
                     name=channel.topic,
-                    type=_find_type_name(channel),
+                    type=channel.metadata.get("type", ""),
                     count=len(stamps),
                     rate_hz=(len(stamps) - 1) / span_s if span_s > 0.0 else 0.0,
-                    readable=self._find_migration(channel) is not None,
+                    readable=_is_readable(channel),
                 )
             )
         stamps = [stamp for channel_stamps in times.values() for stamp in channel_stamps]
@@ -623,7 +595,8 @@ class BagReader:
                     '"flexsheet"; use a bag that `flexsheet bag record` wrote'
                 )
         elif opcode == Opcode.CHANNEL:
-            self._add_channel(mcap_records.Channel.read(stream))
+            channel = mcap_records.Channel.read(stream)
+            self.channels[channel.id] = channel
         elif opcode == Opcode.SCHEMA:
             schema = mcap_records.Schema.read(stream)
             self.schemas[schema.id] = schema
@@ -633,10 +606,6 @@ class BagReader:
         elif self.chunks:
             index = mcap_records.MessageIndex.read(stream)
             self.chunks[-1].times_ns[index.channel_id] = [time for time, _ in index.records]
-
-    def _add_channel(self, channel: mcap_records.Channel) -> None:
-        channel.topic = RENAMED_TOPICS.get(channel.topic, channel.topic)
-        self.channels[channel.id] = channel
 
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
         """Index the chunks that the index in a truncated bag does not cover.
@@ -656,7 +625,7 @@ class BagReader:
             times: dict[int, list[int]] = {}
             for record in records:
                 if isinstance(record, mcap_records.Channel):
-                    self._add_channel(record)
+                    self.channels[record.id] = record
                 elif isinstance(record, mcap_records.Schema):
                     self.schemas[record.id] = record
                 elif isinstance(record, mcap_records.Message):
@@ -693,44 +662,28 @@ class BagReader:
             if self._topics is None or channel.topic in self._topics
         }
 
-    def _find_migration(self, channel: mcap_records.Channel) -> Migration | None:
-        topic, schema = TOPICS.get(channel.topic), self.schemas.get(channel.schema_id)
-        if topic is None or schema is None:
-            return None
-        try:
-            recorded, fingerprint = json.loads(schema.data), channel.metadata["fingerprint"]
-            bytes.fromhex(fingerprint)
-        except (ValueError, KeyError, RecursionError):
-            return None  # The recorded schema or fingerprint is damaged.
-        return find_migration(topic.message, fingerprint, recorded)
-
-    def _make_decoder(self, channel: mcap_records.Channel) -> ChannelDecoder:
-        """Make a channel's decoder. Raises BagError if its topic or type cannot be converted."""
+    def _check_readable(self, channel: mcap_records.Channel) -> None:
+        """Raise BagError if this version of flexsheet cannot decode the messages of a channel."""
         if channel.topic not in TOPICS:
             raise BagError(
                 f'{self.path}: this version of flexsheet has no topic "{channel.topic}"; '
                 "`BagReader.frames` returns its messages without decoding"
             )
-        migration = self._find_migration(channel)
-        if migration is None:
+        if not _is_readable(channel):
             raise BagError(
                 f'{self.path}: topic "{channel.topic}": the recorded message type '
-                f"{channel.metadata.get('type', '')} has other fields than the current one, and "
-                "messages/migrations.py contains no migration for it; read the bag with the "
-                "version of flexsheet that recorded it, or leave out the topic "
+                f"{channel.metadata.get('type', '')} differs from the current one; read the bag "
+                "with the version of flexsheet that recorded it, or leave out the topic "
                 "(`BagReader.frames` returns its messages as bytes)"
             )
-        return ChannelDecoder(
-            TOPICS[channel.topic],
-            channel.metadata.get("type", TOPICS[channel.topic].message.__name__),
-            bytes.fromhex(channel.metadata["fingerprint"]),
-            migration,
-        )
 
 
-def _find_type_name(channel: mcap_records.Channel) -> str:
-    recorded = channel.metadata.get("type", "")
-    return RENAMED_TYPES.get(recorded, recorded)
+def _is_readable(channel: mcap_records.Channel) -> bool:
+    """Return whether the messages of a channel have the current type of its topic."""
+    topic = TOPICS.get(channel.topic)
+    if topic is None:
+        return False
+    return channel.metadata.get("fingerprint") == compute_fingerprint(topic.message).hex()
 
 
 def info(path: Path | str) -> BagInfo:

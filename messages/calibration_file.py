@@ -16,7 +16,6 @@ from ruamel.yaml.nodes import CollectionNode
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
-from flexsheet.messages.migrations import rename_fields
 from flexsheet.messages.scene import Part
 
 Calibration = TypeVar("Calibration", bound=Part)
@@ -131,7 +130,7 @@ def read_calibration(kind: type[Calibration], path: Path, *, command: str) -> Ca
             f"calibrate again with `{command}`"
         )
     try:
-        return kind.model_validate(rename_fields(kind, content))
+        return kind.model_validate(content)
     except ValidationError as error:
         problems = "; ".join(
             f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"

@@ -12,7 +12,6 @@ from enum import StrEnum
 from flexsheet.messages import apparatus, scene, types
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.migrations import RENAMED_TOPICS
 
 
 class Delivery(StrEnum):
@@ -137,10 +136,6 @@ def find_topic(name: str) -> Topic:
     try:
         return TOPICS[name]
     except KeyError:
-        if name in RENAMED_TOPICS:
-            raise UnknownTopicError(
-                f'unknown topic "{name}"; it was renamed to "{RENAMED_TOPICS[name]}"'
-            ) from None
         near = get_close_matches(name, TOPICS, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; topics: {', '.join(TOPICS)}"
         raise UnknownTopicError(f'unknown topic "{name}"{hint}') from None

@@ -18,8 +18,7 @@ of eight bytes align the elements. Elements are little-endian and in C order.
 `encode` and `decode` do not copy large arrays. A sender must not change an array that is in a
 message, and a receiver gets read-only views of the memory from the socket. Small arrays are copied,
 because this is faster than sending them separately (`benchmarks/messaging.py`). Equal messages with
-equal headers have equal bytes. The protocol "flexsheet/1" of old bags differs only in that `plan`
-is missing.
+equal headers have equal bytes.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ Buffer: TypeAlias = bytes | memoryview
 M = TypeVar("M", bound=Message)
 
 PROTOCOL = "flexsheet/2"
-ELEMENTS = {PROTOCOL: 11, "flexsheet/1": 10}
+HEADER_ELEMENTS = 11
 DTYPES = tuple(
     np.dtype(name)
     for name in ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
@@ -175,19 +174,11 @@ class Envelope:
             raise WireError("field", _describe(error, self.codec.name)) from error
 
 
-def read_envelope(
-    frames: Sequence[Any],
-    expected: Topic | type[Message],
-    *,
-    fingerprint: bytes | None = None,
-    type_name: str | None = None,
-) -> Envelope:
+def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Envelope:
     """Decode a message and check its header, without validating its fields.
 
     frames: buffers (bytes, memoryview or zmq.Frame). The first buffer is the header.
     expected: topic or message type. A topic also limits the size of the message.
-    fingerprint, type_name: fingerprint and name of a recorded message type; None means the values
-        of the current type.
 
     Raises WireError if the message is invalid or unexpected.
     """
@@ -197,31 +188,30 @@ def read_envelope(
             raise _message_size_error(frames, expected.max_bytes, f'topic "{expected.name}"')
     else:
         codec = get_codec(expected)
-    expected_fingerprint = codec.fingerprint if fingerprint is None else fingerprint
     unpacked = _unpack(frames)
-    if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
+    if type(unpacked) is not tuple or len(unpacked) != HEADER_ELEMENTS:
         raise WireError(
             "malformed",
             "this is not a flexsheet message: its header does not have eleven elements",
         )
-    protocol, name, found, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
-    if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
+    protocol, name, found, sequence, source, publish, clock_id, writer, epoch, plan, fields = (
+        unpacked
+    )
+    if type(protocol) is not str or protocol != PROTOCOL:
         raise WireError(
             "malformed",
             f"the message has the protocol {_format_value(protocol)} instead of {PROTOCOL}",
         )
-    plan = unpacked[9] if len(unpacked) == 11 else ""
-    fields = unpacked[-1]
     # The name may be an array, and comparing an array does not give a bool.
-    if type(name) is not str or name != (type_name or codec.name):
+    if type(name) is not str or name != codec.name:
         raise WireError(
             "type", f"the message has the type {_format_value(name)}, expected {codec.name}"
         )
-    if type(found) is not bytes or found != expected_fingerprint:
+    if type(found) is not bytes or found != codec.fingerprint:
         raise WireError(
             "fingerprint",
             f"{codec.name}: the message has the fingerprint {_format_value(found)}, expected "
-            f"{expected_fingerprint.hex()}; run the same version of flexsheet on both hosts",
+            f"{codec.fingerprint.hex()}; run the same version of flexsheet on both hosts",
         )
     for number in (sequence, source, publish, epoch):
         if type(number) is not int or not 0 <= number <= _MAX_INTEGER:

@@ -100,16 +100,13 @@ class NodeImportError(FlexsheetError, ImportError):
 def node_class(name: str) -> type[Node]:
     """Import and return the class of a node type, which is a name in `NODES` or "module:Class".
 
-    The package name may be missing, as in "nodes.planner.node:Planner" in old launch files and
-    bags. Raises UnknownNodeError if the name is unknown, and NodeImportError if the module or the
+    Raises UnknownNodeError if the name is unknown, and NodeImportError if the module or the
     class is missing or invalid.
     """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")
     if class_name and not all(map(str.isidentifier, (*module_name.split("."), class_name))):
         raise UnknownNodeError(f'invalid node type "{name}": expected "package.module:Class"')
-    if module_name.startswith("nodes."):
-        module_name = f"{__package__}.{module_name.removeprefix('nodes.')}"
     if not class_name:
         near = get_close_matches(name, NODES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; known nodes: {', '.join(NODES)}"

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-EXEMPT = {"CHANGELOG.md", "messages/migrations.py", "launch/plans/renamed_keys.py"}
+EXEMPT = {"CHANGELOG.md"}
 """Files that list old names."""
 
 BANNED = {

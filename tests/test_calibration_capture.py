@@ -391,8 +391,8 @@ def test_images_are_taken_from_the_camera_source(
         ((), "exactly one source of images"),
         (("--left", "a*.png"), "exactly one source of images"),
         (("--twin", "SCENE", "--left", "a", "--right", "b"), "exactly one source of images"),
-        (("--device-source", "{kind: opencv, left: 0}"), "requires --scene"),
-        (("--device-source", "{kind: opencv}", "--scene", "SCENE"), "opencv.left: Field required"),
+        (("--device-source", "{kind: live, left: 0}"), "requires --scene"),
+        (("--device-source", "{kind: live}", "--scene", "SCENE"), "live.left: Field required"),
         (("--device-source", "twin", "--scene", "SCENE"), "use --twin SCENE"),
         (
             ("--device-source", "[1,", "--scene", "SCENE"),

@@ -117,7 +117,7 @@ async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side
     """OpenCV opens a video file like a camera. The end of the file corresponds to an unplugged
     camera.
     """
-    source = {"kind": "opencv", "left": str(side_by_side)}
+    source = {"kind": "live", "left": str(side_by_side)}
     async with running(scene, source=source, retry_s=0.01) as bench:
         # A file has no exposure control and its own rate: both are reported once.
         await bench.until(lambda: bench.node.errors >= 4 and len(bench.sent) > 2)
@@ -128,7 +128,7 @@ async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side
 
 async def test_a_camera_that_is_not_there_is_tried_again(scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "camera.avi"
-    source = {"kind": "opencv", "left": str(path)}
+    source = {"kind": "live", "left": str(path)}
     async with running(scene, source=source, retry_s=0.01) as bench:
         await bench.until(lambda: bench.node.errors >= 2)
         assert f"{str(path)!r} cannot be opened" in bench.node.note
@@ -199,7 +199,7 @@ async def test_the_twins_images_are_left_alone_by_a_real_camera(
     [
         (lambda p: VideoSource(kind="video", left=p / "absent.avi"), "absent.avi: file not found"),
         (lambda p: VideoSource(kind="video", left=p / "text.avi"), "cannot be opened"),
-        (lambda p: OpenCvSource(kind="opencv", left=str(p / "absent")), "cannot be opened"),
+        (lambda p: OpenCvSource(kind="live", left=str(p / "absent")), "cannot be opened"),
         (
             lambda p: ImagesSource(kind="images", left=str(p / "x*.png"), right=str(p / "a*.png")),
             "matches no file",
@@ -316,7 +316,7 @@ def test_an_error_inside_opencv_is_a_device_error_and_tried_again(scene: Scene) 
     "source",
     [
         "twim",
-        {"kind": "opencv"},
+        {"kind": "live"},
         {"kind": "video", "left": "a", "lop": True},
         {"kind": "twin", "x": 1},
     ],

@@ -129,14 +129,6 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
             "graph.yaml:6: nodes.beacon.parameters.rate_hz: 'fast' is invalid; "
             "write a number in Hz, without the unit",
         ),
-        (
-            GRAPH + "  triangulator: {type: triangulator, parameters: {ahead_s: 0.1}}\n",
-            'unknown key "ahead_s"; it was renamed to "prediction_horizon_s"',
-        ),
-        (
-            GRAPH + "  triangulator: {type: triangulator, parameters: {tracking: hand}}\n",
-            "'hand' is invalid; it was renamed to \"adaptive\"",
-        ),
         (GRAPH + "    host: left\n", 'unknown host "left"; choose one of: main'),
         (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),
         (GRAPH + "hosts: {main: {}}\n", 'graph.yaml:9: hosts.main: "address" is missing'),

@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,8 @@ from flexsheet.messages.bag import (
     split_frames,
 )
 from flexsheet.messages.base import Header
-from flexsheet.messages.migrations import find_migration
 from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import EStop, StereoPair, TwinFinger
+from flexsheet.messages.types import EStop, Fingertip, StereoPair, TwinFinger
 from flexsheet.messages.wire import WireError, encode
 from tests.waiting import wait_until
 
@@ -384,12 +384,9 @@ def test_full_disk_is_reported(tmp_path: Path) -> None:
 def test_changed_type_is_rejected_by_name_but_its_bytes_stay_readable(
     whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        bag_module,
-        "find_migration",
-        lambda kind, *recorded: None if kind is TwinFinger else find_migration(kind, *recorded),
-    )
-    words = r'topic "twin/finger": the recorded .* TwinFinger has other fields'
+    changed = replace(TOPICS["twin/finger"], message=Fingertip)
+    monkeypatch.setattr(bag_module, "TOPICS", {**TOPICS, "twin/finger": changed})
+    words = r'topic "twin/finger": the recorded .* TwinFinger differs from the current one'
     with pytest.raises(BagError, match=words):
         list(BagReader(whole))
     assert len(list(BagReader(whole, ["stereo"]))) == 20

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any, get_args
 
 import msgpack
@@ -385,13 +384,3 @@ def test_every_array_field_has_a_dtype_of_the_wire() -> None:
             for spec in found + specs(field.annotation):
                 empty = np.zeros([0 if isinstance(n, str) else n for n in spec.shape], spec.dtype)
                 encode(EStop.model_construct(engaged=True, reason=empty), HEADER)
-
-
-def test_a_bag_s_message_from_before_plans_is_read() -> None:
-    stop = EStop(engaged=True, reason="x")
-    head = msgpack.unpackb(as_bytes(encode(stop, replace(HEADER, plan="p")))[0])
-    head[0] = "flexsheet/1"
-    assert refused([msgpack.packb(head)], EStop).cause == "malformed"
-    del head[9]
-    message, header = decode([msgpack.packb(head)], EStop)
-    assert (message, header) == (stop, replace(HEADER, plan=""))

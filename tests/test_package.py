@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 
 import flexsheet
-from flexsheet.nodes import node_class
 from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,13 +43,6 @@ def test_each_public_name_is_documented(name: str) -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="'flexsheet' has no attribute 'unknown'"):
         _ = flexsheet.unknown  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize(("former", "name"), flexsheet._FORMER_NAMES.items())
-def test_a_former_name_is_a_deprecated_alias(former: str, name: str) -> None:
-    assert former not in flexsheet.__all__
-    with pytest.deprecated_call(match=f"use flexsheet.{name}"):
-        assert getattr(flexsheet, former) is getattr(flexsheet, name)
 
 
 def test_static_and_lazy_names_agree() -> None:
@@ -96,10 +88,6 @@ def test_sources_import_the_package_by_its_name() -> None:
         for path in (ROOT / folder).rglob("*.py"):
             found = wrong.search(path.read_text())
             assert found is None, f"{path.relative_to(ROOT)}: {found}"
-
-
-def test_node_types_of_old_launch_files_are_found() -> None:
-    assert node_class("nodes.planner.node:Planner") is node_class("planner")
 
 
 def test_nothing_changes_the_import_path() -> None:

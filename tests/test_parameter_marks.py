@@ -57,8 +57,8 @@ def graph_with(folder: Path, host: str = "left", **parameters: object) -> Resolv
 
 def test_marks_are_found_in_nested_models_and_unions() -> None:
     sources = (
-        OpenCvSource(kind="opencv", left="/dev/video0", right="rtsp://192.0.2.9/left"),
-        OpenCvSource(kind="opencv", left=0),
+        OpenCvSource(kind="live", left="/dev/video0", right="rtsp://192.0.2.9/left"),
+        OpenCvSource(kind="live", left=0),
     )
     found = find_marked(OwnParameters(sources=sources), ParameterMark.DEVICE_FILE)
     assert found == {
@@ -70,7 +70,7 @@ def test_marks_are_found_in_nested_models_and_unions() -> None:
 
 
 def test_device_files_are_those_of_marked_parameters(tmp_path: Path) -> None:
-    camera = {"kind": "opencv", "left": "/dev/video0", "right": "rtsp://192.0.2.9/left"}
+    camera = {"kind": "live", "left": "/dev/video0", "right": "rtsp://192.0.2.9/left"}
     node = graph_with(tmp_path, sources=[camera]).nodes["bridge"]
     assert node.device_files == ("/dev/no-such-tty", "/dev/video0")
 
@@ -90,11 +90,3 @@ def test_a_marked_calibration_file_is_read_when_the_graph_is_loaded(tmp_path: Pa
     (problem,) = caught.value.problems
     assert problem.key == ("nodes", "bridge", "parameters", "optics")
     assert str(tmp_path / "missing.yaml") in problem.what
-
-
-def test_plans_of_old_bags_have_the_addresses_of_their_bridges(tmp_path: Path) -> None:
-    plan = graph_with(tmp_path).model_dump(mode="json")
-    node = plan["nodes"]["bridge"]
-    del node["device_address"]
-    node["parameters"] = {"host": "192.0.2.21", "port": 502}
-    assert ResolvedGraph.model_validate(plan).nodes["bridge"].device_address == "192.0.2.21:502"

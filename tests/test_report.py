@@ -469,11 +469,6 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
     assert found["bag"]["messages"] > 100
 
 
-def test_a_bag_from_before_any_migration_can_be_reported_on() -> None:
-    old = Path(__file__).parent / "recorded" / "before-migrations.mcap"
-    assert make_result(read_session(old))["bag"]["messages"] > 0
-
-
 # The command.
 
 

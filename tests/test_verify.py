@@ -199,7 +199,7 @@ def test_nodes_that_cannot_be_replayed_give_a_reason(bag: Path, name: str, why: 
 
 
 def test_devices_windows_and_pages_are_not_replayed_either(tmp_path: Path) -> None:
-    settings = ["camera.source={kind: opencv, left: /dev/video0}", "renderer.output=window"]
+    settings = ["camera.source={kind: live, left: /dev/video0}", "renderer.output=window"]
     plan = load_graph(ROOT / "launch" / "demo.yaml", settings=settings, console=True)
     assert "reads a device" in refusal(plan.nodes["camera"])
     assert "in a window" in refusal(plan.nodes["renderer"])

@@ -2,9 +2,9 @@
 
 The node is built from the resolved launch file in the bag. Its status messages contain the order
 and time of the messages that it handled (`messages.types.Status.execution_log`). The replay follows
-this log, so it skips the same messages as the live node. Bags of earlier versions contain no log.
-If a bag contains no log, the replay passes all recorded inputs to the node in the order of
-recording. The replay then calls timers when they are due.
+this log, so it skips the same messages as the live node. If a bag contains no log, the replay
+passes all recorded inputs to the node in the order of recording, and calls timers when they are
+due.
 
 The replay runs twice, and both runs must give the same bytes. The fields of the outputs are
 compared with the recorded fields, with a tolerance.

@@ -38,18 +38,9 @@ from ruamel.yaml.tokens import (
     ScalarToken,
 )
 
-from flexsheet.launch.plans.renamed_keys import (
-    LAUNCH_KEYS,
-    NODE_PARAMETERS,
-    REMOVED_KEYS,
-    SCENE_KEYS,
-    VALUES,
-)
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.units import find_unit
-from flexsheet.nodes import NODES
 
 M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
@@ -490,21 +481,14 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
         if error["type"] == "missing":
             return document.problem((*at, *inside), f'"{name}" is missing', f'add "{name}"')
         known = sorted(holder.model_fields) if _is_model(holder) else []
-        key = (*at, *inside, name)
-        renamed = _renamed_keys(model, document, key).get(str(name))
-        remedy = f'it was renamed to "{renamed}"' if renamed else did_you_mean(name, known)
-        if name in REMOVED_KEYS:
-            remedy = "remove the key, because only one method is left"
-        return document.problem(key, f'unknown key "{name}"', remedy)
+        return document.problem(
+            (*at, *inside, name), f'unknown key "{name}"', did_you_mean(name, known)
+        )
     key = _existing_part(document, (*at, *_walk(model, location)[0]))
     if error["type"] in MAPPING_ERROR_TYPES:
         return document.problem(
             key, f"the value is {_name_type(error['input'])}", "write a mapping of keys and values"
         )
-    renamed = VALUES.get(str(key[-1]) if key else "", {}).get(str(error["input"]))
-    if renamed is not None:
-        what = f"{_shorten(error['input'])} is invalid"
-        return document.problem(key, what, f'it was renamed to "{renamed}"')
     name = next((part for part in reversed(key) if isinstance(part, str)), "")
     return document.problem(key, *describe_value_error(error, name))
 
@@ -540,16 +524,6 @@ def _existing_part(document: Document, key: Key) -> Key:
             is_short = isinstance(values, Mapping) and short in values
             return (*key[:number], short) if is_short else key[:number]
     return key
-
-
-def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
-    """Return the new name of each renamed key in the mapping that contains `key`."""
-    if key[0] == "nodes" and key[2:3] == ("parameters",):
-        node_type = document.values["nodes"][key[1]].get("type")
-        # A launch file may also give the class path of a shipped node as its type.
-        names = [name for name, path in NODES.items() if node_type in (name, path)]
-        return NODE_PARAMETERS.get(names[0], {}) if names else {}
-    return SCENE_KEYS if issubclass(model, Scene) else LAUNCH_KEYS
 
 
 def _shorten(value: Any) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bus import Source
@@ -27,28 +27,6 @@ LAUNCHER, TOOLS = "launch", "tools"
 
 RUN_DIRECTORY = "@run"
 """The placeholder for the path of the run's folder in endpoints and parameters."""
-
-
-ROLES_OF_TYPES = {
-    "arm_bridge": NodeRole.ARM_BRIDGE,
-    "camera": NodeRole.CAMERA,
-    "clock": NodeRole.CLOCK,
-    "console": NodeRole.CONSOLE,
-    "recorder": NodeRole.RECORDER,
-    "renderer": NodeRole.RENDERER,
-    "twin_finger": NodeRole.FINGER_SIMULATOR,
-}
-"""The role of each node type.
-
-The table is used for plans in older bags, which do not contain roles.
-"""
-
-
-OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
-"""The node parameters that name a calibration file.
-
-They are used for plans in older bags, which do not list calibrations.
-"""
 
 
 class ArmingMode(StrEnum):
@@ -150,7 +128,7 @@ class ResolvedNode(StrictModel):
     liveness_s: float | None = Field(
         default=None, description="maximum time without a heartbeat, s; null: no limit"
     )
-    nice: int = Field(default=0, description="niceness of the process; 0 in older bags")
+    nice: int = Field(default=0, description="niceness of the process")
     realtime_priority: int | None = Field(
         default=None, description="real-time priority of the process; null: it has none"
     )
@@ -167,22 +145,6 @@ class ResolvedNode(StrictModel):
         """Return the value of the parameter `arming`, or None if the node has no such parameter."""
         value = self.parameters.get("arming")
         return ArmingMode(value) if value in tuple(ArmingMode) else None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _add_missing_fields(cls, values: Any) -> Any:
-        if not isinstance(values, dict):
-            return values
-        derived: dict[str, Any] = {"role": ROLES_OF_TYPES.get(str(values.get("type")))}
-        parameters = values.get("parameters")
-        if isinstance(parameters, dict):
-            host, port = parameters.get("host"), parameters.get("port")
-            if host is not None and port is not None:
-                derived["device_address"] = f"{host}:{port}"
-            derived["calibrations"] = {
-                name: parameters[name] for name in OLD_CALIBRATIONS if parameters.get(name)
-            }
-        return {**derived, **values}
 
 
 @dataclass(frozen=True, slots=True)

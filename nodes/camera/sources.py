@@ -30,9 +30,7 @@ class OpenCvSource(CameraSource):
     Two cameras without a common trigger expose at different times (`docs/camera.md`).
     """
 
-    kind: Literal["live", "opencv"] = Field(
-        description="live: images of real cameras. opencv: former name of the value live"
-    )
+    kind: Literal["live"] = Field(description="images of real cameras")
     left: int | DeviceFile = Field(
         description="left camera, or camera with both views side by side: number, path or address; "
         "aravis: name of the camera; realsense: serial number, or empty; gstreamer: pipeline"
