@@ -18,7 +18,7 @@ from playwright.async_api import async_playwright, expect
 
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.console import panels
-from flexsheet.nodes.console.access_control import AccessControl, start_server
+from flexsheet.nodes.console.access_control import start_server
 from flexsheet.nodes.console.banner import GraphState
 from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.page import Page
@@ -58,7 +58,7 @@ class PageVisit:
     slider_boxes: dict[str, Any] = field(default_factory=dict)
     stop_boxes: dict[str, Any] = field(default_factory=dict)
     single_sample_ink: float = 0.0
-    framed: dict[str, int] = field(default_factory=dict)
+    framed: dict[str, str | None] = field(default_factory=dict)
 
 
 @asynccontextmanager
@@ -180,7 +180,7 @@ async def open_in_frames(url: str, tab: BrowserTab, found: PageVisit) -> None:
         for tag in ("iframe", "object", "embed"):
             async with tab.expect_response(url) as answer:
                 await tab.goto(f"http://localhost:{site.server_port}/{tag}")
-            found.framed[tag] = (await answer.value).status
+            found.framed[tag] = (await answer.value).headers.get("x-frame-options")
     finally:
         await asyncio.to_thread(site.shutdown)
         site.server_close()
@@ -188,7 +188,7 @@ async def open_in_frames(url: str, tab: BrowserTab, found: PageVisit) -> None:
 
 async def visit() -> PageVisit:
     found = PageVisit()
-    server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "flexsheet")
+    server = start_server(0, "flexsheet")
     page = Page(server, lambda *_: None, with_finger=True, others_may=(MARKUP,))
     url = f"http://127.0.0.1:{server.get_port()}/"
     try:
@@ -237,4 +237,4 @@ def test_a_single_sample_is_a_point_of_the_chart(found: PageVisit) -> None:
 
 
 def test_the_console_is_not_shown_in_a_frame(found: PageVisit) -> None:
-    assert found.framed == {"iframe": 403, "object": 403, "embed": 403}
+    assert found.framed == {"iframe": "DENY", "object": "DENY", "embed": "DENY"}

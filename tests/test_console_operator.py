@@ -14,7 +14,7 @@ import pytest
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.types import Display, FingerPath, Recording
-from flexsheet.nodes.console.access_control import AccessControl, start_server
+from flexsheet.nodes.console.access_control import start_server
 from flexsheet.nodes.console.controller import (
     MAX_DRAWING_S,
     SETTLE_S,
@@ -96,7 +96,7 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     )
     files.bags.mkdir()
     sent: list[Message] = []
-    server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "test")
+    server = start_server(0, "test")
     finger = FingerController(sent.append, speed_m_per_s=0.15)
     facts = GraphFacts(recorders=("tape",), records_on_request=True, solvers=("body",))
     controller = ConsoleController(sent.append, files, finger, pytest.fail, facts)

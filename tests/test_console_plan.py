@@ -58,10 +58,6 @@ def test_the_files_console_and_recorder_remain(graph: Path, tmp_path: Path) -> N
     graph.write_text(text.replace("twin_finger: {type: twin_finger}", "fem_solver: {type: x:Y}"))
     with pytest.raises(BadInputError):
         load_graph(graph, console=True)
-    open_page = "console.address=192.0.2.1"
-    graph.write_text(text)
-    with pytest.raises(BadInputError, match="token_file"):
-        load_graph(graph, console=True, settings=[open_page])
 
 
 def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path) -> None:

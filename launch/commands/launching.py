@@ -133,9 +133,7 @@ def launch(
 
 def page_url(console: ResolvedNode) -> str:
     """Return the URL of a console's page. The console node must have a fixed port."""
-    address = console.parameters["address"]
-    host = f"[{address}]" if ":" in address else address
-    return f"http://{host}:{console.parameters['page_port']}/"
+    return f"http://127.0.0.1:{console.parameters['page_port']}/"
 
 
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:

@@ -32,6 +32,8 @@ def inject_assets(response: Response) -> Response:
     headers = Headers(response.headers)
     del headers["Content-Length"]
     headers["Content-Length"] = str(len(body))
+    # In a frame, another page could hide the element that the user clicks.
+    headers["X-Frame-Options"] = "DENY"
     return Response(response.status_code, response.reason_phrase, headers, body)
 
 

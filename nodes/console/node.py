@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Positive, Scene
@@ -31,14 +30,8 @@ TOPICS_READ = {
 
 
 class ConsoleParameters(NodeParameters):
-    address: str = Field(default="127.0.0.1", description="IP address of the page.")
     page_port: ListenPort = Field(
         default=8080, description="TCP port of the page. 0: any free port."
-    )
-    token_file: Path | None = Field(
-        default=None,
-        description="File with the token that viewers need. It is required unless the address is "
-        "loopback.",
     )
     rate_hz: Positive = Field(default=25.0, description="Update rate of the 3D view, Hz.")
     tables_hz: Positive = Field(default=2.0, description="Update rate of tables and charts, Hz.")
@@ -63,25 +56,6 @@ class ConsoleParameters(NodeParameters):
         default=Path("@run/console-state.json"),
         description="File from which a restarted console loads its state.",
     )
-
-    @field_validator("address")
-    @classmethod
-    def _is_an_address(cls, address: str) -> str:
-        try:
-            return str(ip_address(address))
-        except ValueError:
-            raise ValueError(
-                f'address: "{address}" is not an IP address; use for example 127.0.0.1'
-            ) from None
-
-    @model_validator(mode="after")
-    def _has_access_control(self) -> Self:
-        if self.token_file is None and not ip_address(self.address).is_loopback:
-            raise ValueError(
-                f"address {self.address} is not loopback and requires a token; set token_file, "
-                "or use 127.0.0.1 with ssh -L"
-            )
-        return self
 
 
 class Console(Node):
@@ -114,16 +88,14 @@ class Console(Node):
 
     async def setup(self) -> None:
         # Imported here, because importing the libraries takes a second and the launcher needs none.
-        from flexsheet.nodes.console.access_control import AccessControl, read_token, start_server
+        from flexsheet.nodes.console.access_control import ADDRESS, start_server
         from flexsheet.nodes.console.operator import Operator
 
         settings = self.parameters
-        token = None if settings.token_file is None else read_token(settings.token_file)
-        access = AccessControl(settings.address, token)
         self._loop = asyncio.get_running_loop()
         self._latest = LatestMessages(self._refused)
-        self._server = start_server(settings.address, settings.page_port, access, "flexsheet")
-        self.url = f"http://{settings.address}:{self._server.get_port()}/"
+        self._server = start_server(settings.page_port, "flexsheet")
+        self.url = f"http://{ADDRESS}:{self._server.get_port()}/"
         finger = FingerController(self._publish, speed_m_per_s=settings.finger_speed_m_per_s)
         files = ConsoleFiles(settings.plan, settings.scenes, settings.bags, settings.state_file)
         facts = GraphFacts.from_plan(settings.plan, self.name)
