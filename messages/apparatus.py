@@ -229,21 +229,6 @@ class FingerTruth(Part):
     hand_stiffness_n_per_m: NonNegative | None = None
 
 
-class GaugeTruth(Part):
-    """The errors of the simulated force gauge."""
-
-    noise_n: Annotated[float, Field(ge=0, le=10)] = Field(
-        default=0.0, description="standard deviation of a reading"
-    )
-    offset_n: Annotated[float, Field(ge=-10, le=10)] = Field(
-        default=0.0, description="reading while no force acts"
-    )
-    gain_ratio: NearOne = 1.0
-    lag_s: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.0, description="timestamp of a reading minus the true time of its force"
-    )
-
-
 class EyesTruth(Part):
     """The deviations of the true eye positions from the positions that the renderer assumes.
 
@@ -310,7 +295,6 @@ class Apparatus(Message):
     arms: ArmsTruth = Field(default_factory=ArmsTruth)
     sheet: SheetTruth = Field(default_factory=SheetTruth)
     finger: FingerTruth = Field(default_factory=FingerTruth)
-    gauge: GaugeTruth = Field(default_factory=GaugeTruth)
     eyes: EyesTruth = Field(default_factory=EyesTruth)
     projector: ProjectorTruth = Field(default_factory=ProjectorTruth)
 

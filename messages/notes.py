@@ -413,40 +413,10 @@ class NodeNote(Enum):
         "The note counts the results of the marker detection: `ok` and reasons for no marker.",
         "`flexsheet explain REASON` explains each reason. Late pairs: " + BUSY_FIRST,
     )
-    OSC_COUNTS = (
-        "of other addresses",
-        "The note counts the accepted and rejected messages of the tracking program.",
-        "If nothing is accepted, compare the addresses with the parameters of the node.",
-    )
-    UDP_PORT_USED = (
-        "cannot listen on",
-        "The node cannot open the port at which it receives the tracking program's messages.",
-        "End the program that uses the port, or change the parameter `port` of the node.",
-    )
-    EYES_TRACKED = (
-        "the eyes are tracked",
-        "The node measures the position of the user's eyes.",
-        NO_ACTION,
-    )
-    EYES_NOT_TRACKED = (
-        "the eyes are not tracked",
-        "The position of the user's eyes is not measured.",
-        "Check the head camera, its light, and that the face is in its image.",
-    )
     EYES_OF_SCENE = (
         "the eyes of the scene are used",
         "The image is drawn for the eyes of the scene file instead of the measured eyes.",
         "Check the node that measures the eyes: `flexsheet topic echo eye`.",
-    )
-    NO_GAUGE = (
-        "no gauge:",
-        "The force gauge cannot be read.",
-        "Correct what the note states: cable or parameters of the node. It tries again by itself.",
-    )
-    GAUGE_LINES = (
-        "lines without a number",
-        "The force gauge has sent lines that are no measured force.",
-        "Compare the format of the gauge with the parameters of the node (docs/force.md).",
     )
     CLOCK_OFFSETS = (
         "clock offset of",

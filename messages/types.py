@@ -330,33 +330,16 @@ class SoftBody(Message):
     displacement_world_m: Points3
 
 
-ForceSource = Literal["gauge", "motor_currents"]
-ForceAxis = Literal["sheet_normal", "left_edge", "right_edge"]
-"""The component of a force that a sensor measures, in the sheet frame.
-
-sheet_normal: force of the finger on the sheet, positive away from the user.
-left_edge, right_edge: force of the sheet on the clamped edge at an arm, positive towards the other
-    edge.
-"""
-
-ForceReason = Literal["ok", "no_reading", "overload", "in_motion"]
-"""The reason why a measured force is not valid; "ok" if it is valid.
-
-no_reading: the device has sent no readable number for some time.
-overload: the force exceeds the range of the device.
-in_motion: the arm moves, so its motor currents also depend on friction and acceleration.
-"""
-
-
 class Force(Message):
-    """A measured force. The source timestamp is the time of the measurement."""
+    """The force of the finger on the sheet, as measured by a sensor of the user.
 
-    source: ForceSource
-    axis: ForceAxis
-    valid: bool
-    reason: ForceReason
+    The source timestamp is the time of the measurement.
+    """
+
+    valid: bool = Field(description="false: the sensor gives no usable value")
     force_n: Finite = Field(
-        description="measured force, N; the last valid force if `valid` is false"
+        description="force along the sheet's normal, positive away from the user, N; the last "
+        "valid force if `valid` is false"
     )
     standard_deviation_n: NonNegative = Field(
         description="standard deviation of noise and calibration error, N"

@@ -56,19 +56,15 @@ class OmissionReason(StrEnum):
 NODES: dict[str, str] = {
     "camera": "flexsheet.nodes.camera.node:Camera",
     "triangulator": "flexsheet.nodes.triangulator.node:Triangulator",
-    "osc_input": "flexsheet.nodes.triangulator.osc_node:OscInput",
-    "head_camera": "flexsheet.nodes.camera.head_node:HeadCamera",
     "planner": "flexsheet.nodes.planner.node:Planner",
     "arm_bridge": "flexsheet.nodes.arm_bridge.node:ArmBridge",
     "fem_solver": "flexsheet.nodes.fem_solver.node:FemSolver",
     "renderer": "flexsheet.nodes.renderer.node:Renderer",
-    "gauge": "flexsheet.nodes.gauge.node:Gauge",
     "clock": "flexsheet.nodes.clock.node:ClockNode",
     "recorder": "flexsheet.nodes.recorder.node:Recorder",
     "console": "flexsheet.nodes.console.node:Console",
     "twin_finger": "flexsheet.nodes.twin.finger_node:TwinFingerNode",
     "twin_arms": "flexsheet.nodes.twin.arms_node:TwinArmsNode",
-    "twin_gauge": "flexsheet.nodes.twin.gauge_node:TwinGauge",
     "twin_eye": "flexsheet.nodes.twin.eye_node:TwinEyeNode",
 }
 

@@ -15,7 +15,7 @@ NOTE_NAME = re.compile(
 )
 """The names of variables, attributes, arguments and functions that contain or return notes."""
 
-NO_NOTES = frozenset({"motor_force.py", "access_control.py", "controller.py"})
+NO_NOTES = frozenset({"access_control.py", "controller.py"})
 """The files in which `reason` is a field of another message."""
 
 VALUE = "0"

@@ -45,6 +45,23 @@ async def main():
 asyncio.run(main())
 """
 
+MEASUREMENTS_SCRIPT = """
+from pathlib import Path
+
+async def run():
+    graph = flexsheet.RunningGraph(flexsheet.load_graph(Path("graph.yaml")))
+    async with graph:
+        await graph.wait_ready()
+        program = asyncio.create_task(main())
+        async for eye, _ in flexsheet.read_topic(graph, "eye", count=1):
+            print(eye.centre_world_m)
+        async for force, _ in flexsheet.read_topic(graph, "force", count=1):
+            print(force.force_n)
+        program.cancel()
+
+asyncio.run(run())
+"""
+
 GUARD_DEMO_SCRIPT = """
 from pathlib import Path
 import flexsheet
@@ -124,6 +141,16 @@ def test_the_library_script_runs(tmp_path: Path) -> None:
     )
     assert len(run_script(script, tmp_path).splitlines()) == 30
     assert len([line for line in script.splitlines() if line.strip()]) <= 13
+
+
+def test_the_script_that_publishes_measurements_runs(tmp_path: Path) -> None:
+    """A graph receives the positions of the eyes and the forces that the script publishes."""
+    script = python_block("library.md", "flexsheet.GraphWriter").replace("asyncio.run(main())", "")
+    (tmp_path / "graph.yaml").write_text(
+        "nodes: {source: {type: 'tests.launch_nodes:FingertipSource'}}\n"
+    )
+    printed = run_script(script + MEASUREMENTS_SCRIPT, tmp_path)
+    assert printed.splitlines() == ["[0.  0.1 0.6]", "1.5"]
 
 
 @pytest.mark.alone

@@ -44,8 +44,7 @@ COLOUR = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
 FURTHER: tuple[tuple[str, Message], ...] = (
     ("eye", Eye(valid=True, centre_world_m=np.array([0.1, 0.2, 0.9]),
                 right_world=np.array([0.0, 2.0, 0.0]))),
-    ("force", Force(source="gauge", axis="left_edge", valid=True, reason="ok", force_n=3.0,
-                    standard_deviation_n=0.1)),
+    ("force", Force(valid=True, force_n=3.0, standard_deviation_n=0.1)),
     ("twin/finger", TwinFinger(path_label="a", path_done=False, path_time_s=1.0,
                                position_world_m=TIP, velocity_world_m_per_s=2 * TIP,
                                force_world_n=3 * TIP)),
@@ -115,7 +114,7 @@ def test_an_independent_reader_finds_all_values(bag: Path, tmp_path: Path) -> No
     assert np.linalg.norm(np.subtract(corners[2], corners[0])) == pytest.approx(
         SCENE.sheet.height_m
     )
-    assert found["/force/wrench"][0][1].wrench.force.x == 3.0
+    assert found["/force/wrench"][0][1].wrench.force.z == -3.0
     assert found["/twin/finger/force"][0][1].wrench.force.z == 3 * TIP[2]
     assert found["/estop/engaged"][0][1].data is True
 

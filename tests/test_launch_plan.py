@@ -224,7 +224,7 @@ def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
     assert recorder.parameters["compress"] is False
     assert {port.topic for port in recorder.inputs} == {
         "twin/finger", "arming", "estop", "host", "status", "display", "twin/finger_path", "eye",
-        "recording", "bookmark", "parameter",
+        "recording", "bookmark", "parameter", "force",
     }  # fmt: skip
 
 
@@ -286,7 +286,7 @@ def test_the_example_of_the_page_on_launch_files_resolves(tmp_path: Path) -> Non
 
 
 def test_an_optional_input_without_a_writer_is_not_connected(tmp_path: Path) -> None:
-    """The planner reads the latency of arms and forces where the graph has arms and a gauge."""
+    """The planner reads the latency of arms where the graph has arms."""
     file = tmp_path / "graph.yaml"
     file.write_text(
         f"scene: {ROOT}/launch/scenes/cylinder.yaml\nexternal_topics: [fingertip, soft_body]\n"
@@ -295,9 +295,8 @@ def test_an_optional_input_without_a_writer_is_not_connected(tmp_path: Path) -> 
     ports = {port.port: port for port in load_graph(file).nodes["planner"].inputs}
     assert ports["fingertip"].endpoints
     assert not ports["arm_latency"].endpoints
-    assert not ports["force"].endpoints
-    with_both = load_graph(ROOT / "launch" / "force.yaml").nodes["planner"]
-    assert all(port.endpoints for port in with_both.inputs)
+    with_arms = load_graph(ROOT / "launch" / "demo.yaml").nodes["planner"]
+    assert all(port.endpoints for port in with_arms.inputs)
 
 
 def test_a_launch_file_extends_another_by_name(tmp_path: Path) -> None:

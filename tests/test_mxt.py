@@ -17,18 +17,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.messages.clock import SystemClock
-from flexsheet.messages.types import Force
 from flexsheet.nodes.arm_bridge.link import (
     ArmAnswerError,
     ArmLinkError,
     ArmRefusedError,
     ArmSilentError,
     BlockField,
-)
-from flexsheet.nodes.arm_bridge.motor_force import (
-    MotorForceCalibration,
-    MotorForceEstimator,
-    estimate_pull_n,
 )
 from flexsheet.nodes.arm_bridge.mxt import (
     COMMAND_END,
@@ -43,18 +37,11 @@ from flexsheet.nodes.arm_bridge.mxt import (
     encode_joints,
     has_advanced,
 )
-from flexsheet.nodes.arm_bridge.node import ArmBridge
-from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
-    RV_1A_MECHANICS,
     Fault,
 )
-from flexsheet.nodes.twin.arms_node import joint_torques_nm
 from flexsheet.nodes.twin.mxt_controller import (
-    FRICTION_PERCENT,
-    TORQUE_PER_PERCENT_NM,
-    UNLOADED_PERCENT,
     MxtController,
     MxtServer,
 )
@@ -62,7 +49,6 @@ from tests.examples import examples
 from tests.rv_1a import (
     RANGE_RAD,
     SPEED_RAD_PER_S,
-    forward,
 )
 from tests.waiting import DEADLINE_S
 from website.arms_page import render_packet
@@ -469,90 +455,3 @@ def test_the_document_lists_the_rejections() -> None:
     source = (root / "nodes/twin/mxt_controller.py").read_text()
     for words in re.findall(r'MxtError\("([^"]+)"\)', source):
         assert words in text, words
-
-
-def answer_with_currents(controller: MxtController) -> bytes:
-    """Return the controller's answer to a packet that requests the motor currents."""
-    controller.receive_command(encode(COMMAND_NONE, with_currents=True), ME)
-    controller.advance(CONTROLLER_CYCLE_S)
-    ((packet, _),) = controller.answers
-    return packet
-
-
-def test_motor_currents_are_requested_and_decoded() -> None:
-    packet = encode_joints(JOINTS, with_currents=True)
-    assert packet[64:68].hex() == "0b000000"
-    assert encode_joints(JOINTS)[64:] == bytes(132)
-    controller = MxtController(JOINTS, servo_lag_s=0.02, filter_s=0.0, noise_rad=0.0, timeout_s=1.0)
-    plain = decode_answer(answer_with_currents(controller))
-    assert plain.currents_percent is not None
-    assert np.abs(plain.currents_percent - UNLOADED_PERCENT).max() <= FRICTION_PERCENT + 0.5
-    controller.answers.clear()
-    controller.load_nm = 10.0 * TORQUE_PER_PERCENT_NM
-    loaded = decode_answer(answer_with_currents(controller))
-    assert loaded.currents_percent == pytest.approx(plain.currents_percent - 10.0)
-
-
-def test_without_a_request_there_are_no_currents() -> None:
-    controller = MxtController(JOINTS, servo_lag_s=0.02, filter_s=0.0, noise_rad=0.0, timeout_s=1.0)
-    controller.receive_command(encode(COMMAND_NONE), ME)
-    controller.advance(CONTROLLER_CYCLE_S)
-    ((packet, _),) = controller.answers
-    assert decode_answer(packet).currents_percent is None
-
-
-def test_the_pull_of_the_sheet_follows_from_the_currents_within_its_uncertainty() -> None:
-    calibration = MotorForceCalibration(
-        torque_per_percent_nm=tuple(TORQUE_PER_PERCENT_NM.tolist()),
-        unloaded_percent=tuple(UNLOADED_PERCENT.tolist()),
-        friction_percent=FRICTION_PERCENT / 3.0**0.5,
-    )
-    clamp = np.eye(4)
-    clamp[:3, 3] = [0.0, 0.0, 0.05]
-    towards = np.array([0.6, 0.0, 0.8])
-    ratios, deviation_n = [], 0.0
-    for seed in range(60):
-        controller = MxtController(
-            JOINTS, servo_lag_s=0.02, filter_s=0.0, noise_rad=0.0, timeout_s=1.0, seed=seed
-        )
-        controller.load_nm = joint_torques_nm(RV_1A_MECHANICS, JOINTS, clamp, 12.0 * towards)
-        currents = decode_answer(answer_with_currents(controller)).currents_percent
-        assert currents is not None
-        force_n, deviation_n = estimate_pull_n(
-            calibration, JOINTS, currents, clamp[:3, 3], towards, forward=forward
-        )
-        ratios.append((force_n - 12.0) / deviation_n)
-    assert np.std(ratios) == pytest.approx(1.0, abs=0.3)
-    assert abs(np.mean(ratios)) < 0.4
-    assert 0.5 < deviation_n < 12.0
-
-
-def test_a_force_of_a_moving_arm_is_invalid() -> None:
-    calibration = MotorForceCalibration(
-        torque_per_percent_nm=(0.3,) * 6, unloaded_percent=(0.0,) * 6
-    )
-    estimator = MotorForceEstimator(calibration, "right")
-    towards = np.array([1.0, 0.0, 0.0])
-
-    def update(at_ms: int, joints: Floats) -> Force | None:
-        return estimator.update(
-            at_ms * 1_000_000, joints, np.zeros(6), np.zeros(3), towards, forward=forward
-        )
-
-    assert update(0, JOINTS) is None
-    assert update(10, JOINTS) is None
-    resting, moving = update(60, JOINTS), update(120, JOINTS + 0.002)
-    assert resting is not None
-    assert moving is not None
-    assert (resting.valid, resting.axis, resting.source) == (True, "right_edge", "motor_currents")
-    assert (moving.valid, moving.reason) == (False, "in_motion")
-
-
-def test_only_a_bridge_with_the_calibration_publishes_forces() -> None:
-    numbers = {"torque_per_percent_nm": [0.3] * 6, "unloaded_percent": [0.0] * 6}
-    given = {"side": "left", "driver": "mxt", "motor_force": numbers}
-    assert ArmBridge.unused_outputs(ArmBridgeParameters.model_validate(given)) == frozenset()
-    without = ArmBridgeParameters(side="left")
-    assert ArmBridge.unused_outputs(without) == frozenset({"force"})
-    with pytest.raises(ValueError, match="motor_force requires driver mxt"):
-        ArmBridgeParameters.model_validate({**given, "driver": "modbus"})

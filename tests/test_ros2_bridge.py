@@ -19,11 +19,10 @@ import numpy as np
 import pytest
 
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.launch.ros2.inputs import INPUTS, ExternalInputs
+from flexsheet.launch.ros2.inputs import INPUTS, ExternalInputs, Rejection
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.launch.running.tools import GraphWriter
 from flexsheet.messages.types import Eye, Fingertip
-from flexsheet.nodes.external_input import Rejection
 from tests.example_bag import LEFT, RECORDED, SCENE, TIP, arm
 from tests.fingertips import fingertip
 from tests.waiting import until

@@ -17,7 +17,6 @@ SHARED_MODULES = {
     "flexsheet.nodes.arrays",
     "flexsheet.nodes.background",
     "flexsheet.nodes.cache",
-    "flexsheet.nodes.external_input",
     "flexsheet.nodes.methods",
     "flexsheet.nodes.models",
     "flexsheet.nodes.node",

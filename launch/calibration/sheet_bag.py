@@ -60,7 +60,7 @@ def read_pushes(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
             case ArmState():
                 pose = message.world_from_flange.ravel()
                 flanges[message.side].append((header.source_ns, pose))
-            case Force() if message.valid and message.axis == "sheet_normal":
+            case Force() if message.valid:
                 forces.append((header.source_ns, message.force_n))
             case _:
                 pass
@@ -75,7 +75,7 @@ def read_pushes(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
     if scene is None or missing:
         raise SheetModelFitError(
             f"the bag has no valid messages of the topics {', '.join(missing)}; record a graph "
-            "with a gauge (docs/force.md)"
+            "with a force sensor (docs/library.md)"
         )
     pushes = select_pushes(
         scene,

@@ -335,8 +335,6 @@ def compliance(
         "model": ("method", ""),
         "offset, mm": ("normal_offset_mm", ".2f"),
     }
-    if "measured_n" in result["rows"][0]:
-        columns["measured, N"] = ("measured_n", ".2f")
     print_columns(result["rows"], columns)
     words.print(f"errors are relative to {result['reference']}")
     for place in result["against_reference"]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, Force, SoftBody, TwinArms, TwinFinger
+from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
     TARGET_ERROR_RATIO,
@@ -66,9 +66,6 @@ APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
 """The duration (s) of a rest, and the time (s) at its end in which the force is evaluated."""
-
-MEASURED_S = 0.6
-"""The time (s) at the end of each rest over which the measured forces of a gauge are averaged."""
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
@@ -207,7 +204,6 @@ class ComplianceRecording:
     curves: list[Floats]
     methods: list[str]
     apparatus: Apparatus | None = None
-    forces: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def read_bag(bag: Path) -> ComplianceRecording:
@@ -221,8 +217,7 @@ def read_bag(bag: Path) -> ComplianceRecording:
     windows: dict[str, tuple[int, int]] = {}
     flanges: tuple[list[tuple[int, Floats]], list[tuple[int, Floats]]] = ([], [])
     curves: list[tuple[int, Floats, str]] = []
-    forces: list[tuple[float, float]] = []
-    topics = ["scene", "twin/apparatus", "twin/finger", "twin/arms", "soft_body", "force"]
+    topics = ["scene", "twin/apparatus", "twin/finger", "twin/arms", "soft_body"]
     for _, message, header, _ in BagReader(bag, topics=topics):
         match message:
             case Scene():
@@ -238,8 +233,6 @@ def read_bag(bag: Path) -> ComplianceRecording:
                 flanges[1].append((header.source_ns, message.world_from_flange_right.ravel()))
             case SoftBody() if len(message.force_curve) > 0:
                 curves.append((header.source_ns, message.force_curve, message.method))
-            case Force() if message.valid and message.axis == "sheet_normal":
-                forces.append((header.source_ns, message.force_n))
             case _:
                 pass
     if scene is None or not curves:
@@ -256,7 +249,6 @@ def read_bag(bag: Path) -> ComplianceRecording:
         curve_times_ns=[time for time, _, _ in curves],
         curves=[curve for _, curve, _ in curves],
         methods=[method for _, _, method in curves],
-        forces=np.array(forces).reshape(-1, 2),
     )
 
 
@@ -428,8 +420,6 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         for hold in press.holds:
             times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, REST_SAMPLES) * 1e9)
             row = _make_row(press, hold, [reference.evaluate(int(at), press) for at in times])
-            if len(recorded.forces):
-                row["measured_n"] = _measure_n(recorded.forces, begin_ns, hold)
             resting.append(row)
         if not press.holds:
             moving = list(_evaluate_moving(reference, press, begin_ns, end_ns))
@@ -463,21 +453,6 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         "apparatus": "nominal" if recorded.apparatus is None else recorded.apparatus.origin,
         "bag": str(bag),
     }
-
-
-def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
-    """Return the mean force (N) that a force gauge measured while the finger rested.
-
-    Return None if there are no measurements. The force is averaged over the last MEASURED_S of the
-    rest. This time is long because gauges respond slowly.
-
-    forces: array (k, 2) of k times (ns) and forces (N).
-    begin_ns: start of the finger path.
-    hold: interval in which the finger rests.
-    """
-    since_s = 1e-9 * (forces[:, 0] - begin_ns)
-    chosen = forces[(since_s > hold.end_s - MEASURED_S) & (since_s < hold.end_s), 1]
-    return float(chosen.mean()) if len(chosen) else None
 
 
 def _evaluate_moving(

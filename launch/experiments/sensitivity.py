@@ -79,7 +79,6 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "arms": frozenset({Metric.SHEET, Metric.IMAGE, Metric.FORCE}),
     "sheet": frozenset({Metric.SHEET, Metric.IMAGE, Metric.FORCE}),
     "finger": frozenset(Metric),
-    "gauge": frozenset(),
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
 }

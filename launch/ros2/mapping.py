@@ -298,18 +298,8 @@ def _wrench(source: Source, force: Any, frame: str = WORLD) -> Any:
     return source.stamped("geometry_msgs/msg/WrenchStamped", "wrench", wrench, frame)
 
 
-FORCE_DIRECTIONS = {
-    "sheet_normal": (0.0, 0.0, -1.0),
-    "left_edge": (1.0, 0.0, 0.0),
-    "right_edge": (-1.0, 0.0, 0.0),
-}
-"""The direction (3,) of a positive force, in the frame of the sheet, for each sensor axis."""
-
-
 def _measured_force(force: Force, source: Source) -> Any | None:
-    if not force.valid:
-        return None
-    return _wrench(source, force.force_n * np.array(FORCE_DIRECTIONS[force.axis]), "sheet")
+    return _wrench(source, [0.0, 0.0, -force.force_n], "sheet") if force.valid else None
 
 
 def list_joints(side: str) -> list[str]:

@@ -144,16 +144,11 @@ class CounterMonitor:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """An arm's answer: measured joint angles (6,) rad, faults, and the freshness of the angles.
-
-    currents_percent: motor currents (6,) as a percentage of the rated currents; None if the arm
-        does not report currents.
-    """
+    """An arm's answer: measured joint angles (6,) rad, faults, and the freshness of the angles."""
 
     joints_rad: Floats
     faults: tuple[ArmFault, ...]
     freshness: Freshness = field(default=Freshness.FIRST, kw_only=True)
-    currents_percent: Floats | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)

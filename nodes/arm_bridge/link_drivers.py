@@ -18,16 +18,11 @@ connections."""
 _LINKS: dict[Driver, Any] = {"modbus": ModbusLink, "mxt": MxtLink, "lines": LineLink}
 
 
-def make_link(
-    driver: Driver, host: str, port: int, timeout_s: float | None, *, with_currents: bool = False
-) -> ArmLink:
+def make_link(driver: Driver, host: str, port: int, timeout_s: float | None) -> ArmLink:
     """Create the link to an arm, without opening a connection.
 
     timeout_s: maximum time to wait for an answer; None means the driver's default.
-    with_currents: whether to request the motor currents, which only MXT controllers report.
     """
     options: dict[str, Any] = {} if timeout_s is None else {"timeout_s": timeout_s}
-    if with_currents:
-        options["with_currents"] = True
     link: ArmLink = _LINKS[driver](host, port, **options)
     return link

@@ -34,7 +34,7 @@ CONTROLLER_CYCLE_S = 0.0071
 PACKET_BYTES = 196
 
 COMMAND_NONE, COMMAND_MOVE, COMMAND_END = 0, 1, 255
-TYPE_NONE, TYPE_JOINTS, TYPE_JOINTS_MEASURED, TYPE_CURRENTS_MEASURED = 0, 2, 8, 11
+TYPE_NONE, TYPE_JOINTS, TYPE_JOINTS_MEASURED = 0, 2, 8
 
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
 """The maximum plausible joint angle. An answer with a larger angle is invalid."""
@@ -63,10 +63,7 @@ PACKET = (
     BlockField("io_data", "H", 1, "0"),
     BlockField("timeouts", "H", 1, "in an answer: the controller's cycles without a command"),
     BlockField("count", "I", 1, "in an answer: the communications since the program's start"),
-    BlockField("monitor_type", "H", 1, "type of a second quantity: 0 none, 11 measured currents"),
-    BlockField("monitor_reserved", "x", 2, "0"),
-    BlockField("currents", "i", 8, "in an answer: motor currents, percent of the rated ones"),
-    BlockField("monitor_flags", "x", 8, "0"),
+    BlockField("more_1", "x", 44, "a second quantity, not requested; 0"),
     BlockField("more_2", "x", 44, "a third"),
     BlockField("more_3", "x", 44, "a fourth"),
 )
@@ -87,27 +84,18 @@ class MxtStatus(ArmStatus):
     timeouts: int
 
 
-def encode(
-    command: int, *, send_type: int = 0, data: Sequence[float] = (), with_currents: bool = False
-) -> bytes:
+def encode(command: int, *, send_type: int = 0, data: Sequence[float] = ()) -> bytes:
     """Encode a command packet that requests the measured joint angles.
 
     send_type, data: type of the data in the command, and up to 8 numbers.
-    with_currents: whether to request the motor currents too.
     """
     padded = (*data, *([0.0] * (8 - len(data))))
-    head = (command, send_type, TYPE_JOINTS_MEASURED, *padded, *([0] * 9))
-    return _PACKET.pack(*head, TYPE_CURRENTS_MEASURED if with_currents else TYPE_NONE, *([0] * 8))
+    return _PACKET.pack(command, send_type, TYPE_JOINTS_MEASURED, *padded, *([0] * 9))
 
 
-def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
+def encode_joints(joints_rad: Floats) -> bytes:
     """Encode a motion to joint angles (6,) rad; raise ValueError unless six angles are finite."""
-    return encode(
-        COMMAND_MOVE,
-        send_type=TYPE_JOINTS,
-        data=validate_joints(joints_rad),
-        with_currents=with_currents,
-    )
+    return encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=validate_joints(joints_rad))
 
 
 def decode_answer(packet: bytes) -> MxtStatus:
@@ -120,7 +108,7 @@ def decode_answer(packet: bytes) -> MxtStatus:
         raise ArmAnswerError(f"the answer has {len(packet)} bytes instead of {PACKET_BYTES}")
     numbers = _PACKET.unpack(packet)
     (command, send_type, receive_type), data = numbers[:3], numbers[3:11]
-    timeouts, count, monitor_type = numbers[18:21]
+    timeouts, count = numbers[18:20]
     if command not in (COMMAND_NONE, COMMAND_MOVE):
         raise ArmRefusedError("the controller has ended external control")
     # According to the manual, both fields contain the type of the answer's data.
@@ -132,16 +120,7 @@ def decode_answer(packet: bytes) -> MxtStatus:
     joints = np.array(data[:JOINTS])
     if not (np.abs(joints) <= MAX_PLAUSIBLE_RAD).all():
         raise ArmAnswerError("a measured joint is not an angle: its value is too large or NaN")
-    currents = None
-    if monitor_type == TYPE_CURRENTS_MEASURED:
-        currents = np.array(numbers[21 : 21 + JOINTS], dtype=np.float64)
-    return MxtStatus(
-        joints_rad=joints,
-        faults=(),
-        count=count,
-        timeouts=timeouts,
-        currents_percent=currents,
-    )
+    return MxtStatus(joints_rad=joints, faults=(), count=count, timeouts=timeouts)
 
 
 def has_advanced(count: int, before: int, steps: int) -> bool:
@@ -165,11 +144,10 @@ class MxtLink:
         port: int,
         *,
         timeout_s: float = 2.0 * CONTROLLER_CYCLE_S,
-        with_currents: bool = False,
     ) -> None:
         self.host, self.port = host, port
         self.stale = 0
-        self._timeout_s, self._with_currents = timeout_s, with_currents
+        self._timeout_s = timeout_s
         self._socket: socket.socket | None = None
         self._count: int | None = None
         self._counters = CounterMonitor()
@@ -188,11 +166,7 @@ class MxtLink:
             self._count, self._unanswered = None, 0
         loop = asyncio.get_running_loop()
         start_s = loop.time()
-        currents = self._with_currents
-        if mode == "move":
-            packet = encode_joints(joints_rad, with_currents=currents)
-        else:
-            packet = encode(COMMAND_NONE, with_currents=currents)
+        packet = encode_joints(joints_rad) if mode == "move" else encode(COMMAND_NONE)
         try:
             link = await self._open()
             self._drop_late_answers(link)

@@ -6,8 +6,6 @@ import asyncio
 from dataclasses import replace
 from typing import Any, ClassVar
 
-import numpy as np
-
 from flexsheet.messages.base import Header
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
@@ -16,7 +14,6 @@ from flexsheet.messages.types import (
     ArmLatency,
     ArmState,
     EStop,
-    Force,
     SheetTarget,
     SheetTrajectory,
     Side,
@@ -27,7 +24,6 @@ from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal, GoalTiming, find_trajectory, make_goal
 from flexsheet.nodes.arm_bridge.link import ArmLinkError, ArmSilentError, ArmStatus, Freshness
 from flexsheet.nodes.arm_bridge.link_drivers import make_link
-from flexsheet.nodes.arm_bridge.motor_force import MotorForceEstimator
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.path_check import PathChecker
@@ -57,11 +53,6 @@ class ArmBridge(Node):
     arming: Input[Arming]
     arm: Output[ArmState]
     arm_latency: Output[ArmLatency]
-    force: Output[Force]
-
-    @classmethod
-    def unused_outputs(cls, parameters: ArmBridgeParameters) -> frozenset[str]:
-        return frozenset() if parameters.motor_force else frozenset({"force"})
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
@@ -72,16 +63,7 @@ class ArmBridge(Node):
 
     async def setup(self) -> None:
         given = self.parameters
-        self._link = make_link(
-            given.driver,
-            given.host,
-            given.port,
-            given.timeout_s,
-            with_currents=given.motor_force is not None,
-        )
-        self._motor_force: MotorForceEstimator | None = None
-        if given.motor_force is not None:
-            self._motor_force = MotorForceEstimator(given.motor_force, given.side)
+        self._link = make_link(given.driver, given.host, given.port, given.timeout_s)
         timeouts = Timeouts(given.hold_after_s, given.stop_after_s)
         self._control = ArmControl(
             timeouts,
@@ -219,27 +201,6 @@ class ArmBridge(Node):
         control.on_measurement(status.joints_rad, status.faults, status.freshness)
         if self.parameters.measure_servo_lag:
             self._measure_lag(command, status)
-        self._estimate_force(geometry, other, status)
-
-    def _estimate_force(
-        self, geometry: ArmGeometry, other: OtherArm | None, status: ArmStatus
-    ) -> None:
-        """Publish the sheet's pull on the arm if the arm has reported motor currents."""
-        if self._motor_force is None or status.currents_percent is None or other is None:
-            return
-        own = geometry.world_from_edge(status.joints_rad)[:3, 3]
-        across = (other.world_from_flange @ geometry.other_flange_from_edge)[:3, 3] - own
-        towards = geometry.base_from_world[:3, :3] @ across
-        force = self._motor_force.update(
-            self._last.measured_ns,
-            status.joints_rad,
-            status.currents_percent,
-            geometry.flange_from_edge[:3, 3],
-            towards / np.linalg.norm(towards),
-            forward=geometry.base_from_flange,
-        )
-        if force is not None:
-            self.force.publish(force, source_ns=self._last.measured_ns)
 
     def _measure_lag(self, command: Command, status: ArmStatus) -> None:
         if command.mode != "move":

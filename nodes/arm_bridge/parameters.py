@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flexsheet.messages.scene import NonNegative, Positive
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.link_drivers import Driver
-from flexsheet.nodes.arm_bridge.motor_force import MotorForceCalibration
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import DeviceHost, DevicePort
 
@@ -73,18 +72,3 @@ class ArmBridgeParameters(NodeParameters):
         "after the start and after each stop; auto: the arm is enabled automatically, which is "
         "permitted only for simulated arms",
     )
-    motor_force: MotorForceCalibration | None = Field(
-        default=None,
-        description="calibration for the estimate of the sheet's pull from the motor currents, "
-        "which is published as topic force; only for the driver mxt; null: the pull is not "
-        "estimated",
-    )
-
-    @model_validator(mode="after")
-    def _check_motor_force(self) -> Self:
-        if self.motor_force is not None and self.driver != "mxt":
-            raise ValueError(
-                f"motor_force requires driver mxt, because {self.driver} has no motor currents; "
-                "remove motor_force or change the driver"
-            )
-        return self

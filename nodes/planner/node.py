@@ -14,7 +14,6 @@ from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_ca
 from flexsheet.messages.types import (
     ArmLatency,
     Fingertip,
-    Force,
     ParameterChange,
     SheetTarget,
     SoftBody,
@@ -25,11 +24,7 @@ from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.force_table import choose_force_model
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.planner.self_checks import (
-    MeasuredForceCheck,
-    PlannedPush,
-    check_stiffness,
-)
+from flexsheet.nodes.planner.self_checks import check_stiffness
 from flexsheet.nodes.planner.timing import (
     ActuationDelayEstimator,
     MonotonicTimestampFilter,
@@ -57,7 +52,7 @@ class Planner(Node):
     Equal inputs result in identical messages.
     """
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_latency", "force"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_latency"})
 
     watched_inputs: ClassVar[frozenset[str]] = frozenset({"fingertip"})
     ends_with_inputs: ClassVar[bool] = True
@@ -68,7 +63,6 @@ class Planner(Node):
     fingertip: Input[Fingertip]
     soft_body: Input[SoftBody]
     arm_latency: Input[ArmLatency]
-    force: Input[Force]
     parameter: Input[ParameterChange]
     sheet_target: Output[SheetTarget]
 
@@ -80,7 +74,6 @@ class Planner(Node):
     async def setup(self) -> None:
         self._trajectory: SheetTrajectoryPlanner | None = None
         self._compliance: ComplianceController | None = None
-        self._force_check: MeasuredForceCheck | None = None
         self._timestamps = MonotonicTimestampFilter()
         self._writer = ("", 0)
         self._first_step_s = 0.0
@@ -119,9 +112,7 @@ class Planner(Node):
             bounds=bounds,
             delay_s=self._horizon_s,
         )
-        self._calibration_checks = check_stiffness(scene.sheet, self._calibration)
-        self.self_checks = self._calibration_checks
-        self._force_check = MeasuredForceCheck(scene, model)
+        self.self_checks = check_stiffness(scene.sheet, self._calibration)
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._timestamps = MonotonicTimestampFilter()
 
@@ -133,10 +124,6 @@ class Planner(Node):
     def on_arm_latency(self, arm: ArmLatency, header: Header) -> None:
         if self.parameters.measure_actuation_delay:
             self._actuation.on_latency(arm.side, arm.latency_s)
-
-    def on_force(self, force: Force, header: Header) -> None:
-        if self._force_check is not None:
-            self._force_check.add_force(force, header.source_ns)
 
     def _update_note(self) -> None:
         late = ""
@@ -199,17 +186,6 @@ class Planner(Node):
     def _publish(self, planned: PlannedStep, source_ns: int) -> None:
         command = planned.command
         valid_at_ns = source_ns + round(self._horizon_s * 1e9)
-        if self._force_check is not None and self.force.message is not None:
-            x, y = planned.contact_sheet_m
-            self._force_check.add_push(
-                PlannedPush(
-                    valid_at_ns,
-                    planned.motion.stretch_ratio,
-                    command.push_depth_m - planned.normal_offset_m,
-                    (float(x), float(y)),
-                )
-            )
-            self.self_checks = (*self._calibration_checks, *self._force_check.result)
         self.sheet_target.publish(
             SheetTarget(
                 phase=command.phase,

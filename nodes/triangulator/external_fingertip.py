@@ -35,7 +35,3 @@ class ExternalFingertip:
         if ((measured_m >= low) & (measured_m <= high)).all():
             reason = self._tracker.update(at_ns, measured_m, self._covariance)
         return self._tracker.make_fingertip(at_ns, reason, measured_m, horizons_s=self._horizons_s)
-
-    def predict(self, at_ns: int) -> Fingertip:
-        """Return a message, marked as invalid, with the fingertip predicted for a time."""
-        return self._tracker.make_fingertip(at_ns, "no_marker", None, horizons_s=self._horizons_s)

@@ -25,7 +25,6 @@ from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
-    ArmMechanics,
     ArmServer,
     Controller,
     Fault,
@@ -98,25 +97,6 @@ def open_joints_file(path: str | None) -> dict[str, Floats]:
         if not exists:
             rows[:] = np.nan
     return {"left": rows[0], "right": rows[1]}
-
-
-def joint_torques_nm(
-    mechanics: ArmMechanics, joints_rad: Floats, flange_from_edge: Floats, force_n: Floats
-) -> Floats:
-    """Return the joint torques (6,), N m, that a force on the sheet's edge causes in an arm.
-
-    joints_rad: joint angles (6,).
-    flange_from_edge: pose (4, 4) of the edge in the flange frame.
-    force_n: force (3,) in the base frame.
-    """
-    step_rad = 1e-4
-    torques = np.zeros(6)
-    for joint, turn in enumerate(step_rad * np.eye(6)):
-        ahead, behind = (
-            mechanics.forward(joints_rad + sign * turn) @ flange_from_edge for sign in (1, -1)
-        )
-        torques[joint] = (ahead[:3, 3] - behind[:3, 3]) @ force_n / (2.0 * step_rad)
-    return torques
 
 
 class TwinArmsNode(Node):
@@ -234,25 +214,6 @@ class TwinArmsNode(Node):
             controller.advance(duration_s)
             self._stored_joints[side][:] = controller.servo.joints_rad
 
-    def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
-        """Pass to the controllers the joint torques that the sheet's tension causes.
-
-        Only controllers with the protocol MXT report torques.
-        """
-        across = right[:3, 3] - left[:3, 3]
-        distance_m = float(np.linalg.norm(across))
-        if self._pull is None or distance_m <= 0.0:
-            return
-        pull_n = self._pull.force_n(distance_m) * across / distance_m
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            controller = self.servers[side].controller
-            if isinstance(controller, MxtController):
-                arm = self._placed[side]
-                force_n = sign * arm.world_from_base[:3, :3].T @ pull_n
-                controller.load_nm = joint_torques_nm(
-                    arm.mechanics, joints[side], arm.flange_from_edge, force_n
-                )
-
     @periodic("rate_hz")
     async def cycle(self) -> None:
         if len(self.servers) < 2:
@@ -273,7 +234,6 @@ class TwinArmsNode(Node):
             left, right = self._pull.displace(
                 left, right, *clamps, time_s=self.clock.now_ns() * 1e-9
             )
-            self._load_motors(joints, left @ clamps[0], right @ clamps[1])
         self.twin__arms.publish(
             TwinArms(
                 joints_left_rad=joints["left"],

@@ -32,30 +32,14 @@ Address = tuple[str, int]
 
 _HEAD = struct.Struct("<HHHxx8f2I5HHI")
 _MONITOR = struct.Struct("<Hxx8f2I")
-_CURRENTS = struct.Struct("<Hxx8i8x")
 _BYTES = 196
 _NONE, _MOVE, _END = 0, 1, 255
-_JOINTS, _PULSES, _CURRENT = (2, 5, 8), 3, 11
+_JOINTS, _PULSES = (2, 5, 8), 3
 _MORE_AT = (64, 108, 152)
-
-TORQUE_PER_PERCENT_NM = np.array([0.3, 0.3, 0.2, 0.05, 0.05, 0.03])
-"""The torque (N m) of each simulated joint per percent of its motor's rated current."""
-
-UNLOADED_PERCENT = np.array([0.0, 22.0, 30.0, 0.0, 8.0, 0.0])
-"""The motor currents (6,) of the simulated arm at rest without a load, in percent of the rated
-currents. Their dependence on the pose is neglected."""
-
-FRICTION_PERCENT = 6.0
-"""The maximum change (percent of the rated current) that static friction of a gear causes in a
-motor's current, in either direction."""
 
 FILTER_S = 0.01
 """The time constant (s) of the low-pass filter that the manufacturer recommends for the instruction
 `Mxt`."""
-
-FRICTION_STREAM = 11
-"""The second element of the random seed of the static friction. It makes the friction independent
-of other random values."""
 
 FIRST_STEP_RAD = 0.01
 """The maximum difference, for each joint, between the first set-point and the measured angle."""
@@ -88,7 +72,6 @@ class MxtController:
     servo_lag_s, backlash_rad: time lag of the joint servos, and backlash of the gears.
     noise_rad: standard deviation of the measured joint angles.
     filter_s: time constant of the low-pass filter on set-points.
-    load_nm (6,): joint torques that the sheet's tension causes. The simulator sets them.
     restart_after_s: time after which the program restarts automatically.
     cycle_s, cycle_jitter_s: mean and standard deviation of the cycle's duration.
     latency_s: time from the arrival of a set-point until the set-point takes effect.
@@ -115,7 +98,6 @@ class MxtController:
         )
         self.fault: Fault = "none"
         self.error = ""
-        self.load_nm = np.zeros(6)
         self.commands = 0
         self.refused = 0
         self.wanted_rad = self.servo.joints_rad.copy()
@@ -133,8 +115,6 @@ class MxtController:
         self._restart_cycles = restart_after_s / cycle_s
         self._noise_rad = noise_rad
         self._random = np.random.default_rng(seed)
-        friction = np.random.default_rng((seed, FRICTION_STREAM))
-        self._stuck_percent = friction.uniform(-FRICTION_PERCENT, FRICTION_PERCENT, 6)
         self._into_cycle_s = 0.0
         self._waiting: tuple[bytes, Address] | None = None
         self._late: list[tuple[int, Floats]] = []
@@ -284,10 +264,7 @@ class MxtController:
         whole = _HEAD.pack(command, found, found, *numbers, *([0] * 5), self._timeouts, self._count)
         for at in _MORE_AT:
             (wanted,) = struct.unpack_from("<H", packet, at)
-            if wanted == _CURRENT:
-                whole += _CURRENTS.pack(wanted, *self._currents_percent(), 0, 0)
-            else:
-                whole += _MONITOR.pack(*self._monitor(wanted))
+            whole += _MONITOR.pack(*self._monitor(wanted))
         return whole[:-4] if self.fault == "bad_crc" else whole
 
     def _monitor(self, wanted_type: int) -> tuple[float, ...]:
@@ -300,15 +277,6 @@ class MxtController:
             joints = self._seen(_JOINTS.index(wanted_type))
             return (wanted_type, *joints, 0.0, 0.0, 0, 0)
         return (0, *([0.0] * 8), 0, 0)
-
-    def _currents_percent(self) -> list[int]:
-        """Return the motor currents (6,) in percent of the rated current, rounded to integers.
-
-        The currents balance the arm's weight and load. Static friction changes each current by a
-        constant random value.
-        """
-        balance = UNLOADED_PERCENT - self.load_nm / TORQUE_PER_PERCENT_NM
-        return [round(float(one)) for one in balance + self._stuck_percent]
 
     def _seen(self, what: int) -> Floats:
         """Return one of three kinds of joint angles (6,), rad, for an answer to the client.

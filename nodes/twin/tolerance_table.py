@@ -291,16 +291,6 @@ _ROWS = (
     Tolerance("finger.hand_stiffness_n_per_m", "N/m", 1.0, LogUniform(50.0, 800.0),
               "finger 200 to 800: Hajian and Howe 1997; arm 100 to 800: Mussa-Ivaldi 1985; "
               f"relaxed finger 50 to 200: {J}"),
-    Tolerance("gauge.noise_n", "N", 1.0, Uniform(0.002, 0.02),
-              f"{J}: last digits of a 10 N gauge"),
-    Tolerance("gauge.offset_n", "N", 1.0, Normal(0.0, 0.02),
-              "force gauges: 0.2 % of 10 N, from memory", calibrated=Normal(0.0, 0.005),
-              calibrated_source=f"{J}: zeroed before use"),
-    Tolerance("gauge.gain_ratio", "", 1.0, Normal(1.0, 0.005),
-              "force gauges: 0.5 % of the reading, from memory",
-              calibrated=Normal(1.0, 0.002), calibrated_source=f"{J}: reference mass"),
-    Tolerance("gauge.lag_s", "ms", MS, Uniform(5e-3, 60e-3),
-              f"{J}: filter and transmission at 10 to 100 Hz"),
     Tolerance("eyes.centre_offset_m", "mm", MM,
               (Normal(0.0, 10e-3), Normal(0.0, 10e-3), Normal(0.0, 15e-3)), J,
               calibrated=Normal(0.0, 5e-3), calibrated_source=f"{J}: head tracker"),
@@ -458,7 +448,7 @@ def iterate_paths(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{name}"
 
 
-TRUTH_SECTIONS = ("camera", "arms", "sheet", "finger", "gauge", "eyes", "projector")
+TRUTH_SECTIONS = ("camera", "arms", "sheet", "finger", "eyes", "projector")
 
 
 def list_differences(apparatus: Apparatus) -> list[tuple[str, Any, Any, str]]:
