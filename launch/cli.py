@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "bag": ("bag",),
     "ros2-bridge": ("ros2_bridge",),
     "arms": ("arms",),
-    "experiment": ("experiment", "experiment_jnd", "experiment_sweeps"),
+    "experiment": ("experiment", "experiment_sweeps"),
     "apparatus": ("apparatus",),
     "scene": ("scene",),
     "demo": ("demo",),

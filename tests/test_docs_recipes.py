@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import subprocess
@@ -9,13 +10,17 @@ import sys
 import tempfile
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import flexsheet
 from flexsheet.launch.experiments.ports import choose_ports
+from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import SheetTarget
 from tests.doc_pages import DOCS, ROOT, blocks
@@ -151,6 +156,33 @@ def test_the_script_that_publishes_measurements_runs(tmp_path: Path) -> None:
     )
     printed = run_script(script + MEASUREMENTS_SCRIPT, tmp_path)
     assert printed.splitlines() == ["[0.  0.1 0.6]", "1.5"]
+
+
+def test_the_staircase_adapts_the_difference(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A participant who feels differences of at least 20 % gets differences around this value."""
+    moduli: list[float] = []
+
+    class Presenter:
+        async def change_scene(self, scene: Scene) -> None:
+            moduli.append(scene.object.material.young_modulus_pa)
+
+    def answer(question: str) -> str:
+        first, second = moduli[-2:] if len(moduli) > 1 else (1.0, 1.0)
+        noticed = max(first, second) >= 1.2 * min(first, second)
+        return "1" if noticed == (first > second) else "2"
+
+    def run(file: Path, settings: list[str], bag: Path, procedure: Any, progress: Any) -> None:
+        asyncio.run(procedure(Presenter(), load_scene(ROOT / "launch/scenes/cylinder.yaml")))
+
+    monkeypatch.setattr(flexsheet, "run_experiment", run)
+    monkeypatch.setattr("builtins.input", answer)
+    exec(python_block("library.md", "run_experiment"), {})
+    increments = [float(line.split(",")[1]) for line in capsys.readouterr().out.splitlines()]
+    assert len(increments) == 40
+    assert len(moduli) == 80
+    assert all(0.15 < one < 0.26 for one in increments[12:])
 
 
 @pytest.mark.alone
