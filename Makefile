@@ -14,7 +14,7 @@ SOURCES := flexsheet messages nodes launch benchmarks website
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: help setup demo try test test-parallel test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits load tune-scenes \
+.PHONY: help setup demo try test test-parallel test-long lint cached bench bench-gpu faults soak limits load tune-scenes \
 	pages charts \
 	docs lock release clean
 
@@ -109,7 +109,6 @@ bench: setup $(DEV_STAMP)  ## measure the figures in docs/results.md
 	$(BIN)/python -m benchmarks.scenes
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_size --output docs/charts
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_regret --output docs/charts
 
@@ -117,22 +116,11 @@ bench: setup $(DEV_STAMP)  ## measure the figures in docs/results.md
 bench-gpu: setup  ## measure frame time, frame rate and lag with the graphics card, for docs/charts
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.frame_rate --output docs/charts
 
-bench-peers: setup  ## compare with other messaging libraries, in a separate network namespace (requires root)
-	$(INSTALL) --no-build-isolation -e '.[peers]'
-	$(BIN)/python -m benchmarks.messaging_peers
-
 faults: setup $(DEV_STAMP)  ## kill processes, and disturb connections between three simulated computers (requires root)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
 
-deploy-trial: setup $(DEV_STAMP)  ## execute the commands of docs/deploy.md on three simulated computers (requires root)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.deploy_trial
-
 soak: setup  ## run strokes and pushes for an hour, to find leaks, drift and losses (docs/soak.md)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soak
-
-fuzz: setup  ## install the fuzzer, and fuzz every decoder of external data for five minutes each
-	$(INSTALL) --no-build-isolation -e '.[fuzz]'
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fuzz
 
 limits: setup $(DEV_STAMP)  ## measure the disturbances of the fingertip in docs/limits.md
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits

@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.messaging import print_report
-from benchmarks.planner_methods import ellipsoid_mesh, sample_geodesic
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Mesh, Pose, Scene
 from flexsheet.messages.types import SoftBody
-from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.models.rigid import angle_between
 from flexsheet.nodes.models.shapes import Shape, make_shape
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
@@ -42,8 +41,34 @@ REPEATS = 7
 PHASES = ("approach", "contact", "hold")
 SPEEDS_M_PER_S = np.geomspace(0.004, 0.2, 24)
 WAY_M = 0.016
+SEMI_AXES_M = (0.05, 0.03, 0.02)
+FRONT = np.array([0.0, 0.0, 1.0])
 GOOD_DEG = 0.5
 AROUND, ALONG = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+
+
+def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Ints]:
+    """Return vertices (v, 3) on the ellipsoid, and triangles (t, 3), of a scaled icosphere."""
+    # Imported late: only benchmarks need it.
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=1.0)
+    return np.asarray(ball.vertices) * SEMI_AXES_M, np.asarray(ball.faces, dtype=np.int64)
+
+
+def sample_geodesic(
+    shape: Shape, heading: Floats, step_m: float, steps: int
+) -> tuple[Floats, Floats]:
+    """Return points and normals (n, 3) along a geodesic from the front of a shape."""
+    found = shape.closest(10.0 * FRONT)
+    path = [(found.point, found.normal)]
+    for _ in range(steps):
+        heading = heading - found.normal * (found.normal @ heading)
+        heading = heading / np.linalg.norm(heading)
+        found = shape.closest(found.point + step_m * heading, previous=found.point)
+        path.append((found.point, found.normal))
+    points, normals = (np.array(part) for part in zip(*path, strict=True))
+    return points, normals
 
 
 def geometries(mesh: Sequence[str] | None) -> dict[str, Mapping[str, Any]]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
-from flexsheet.nodes.fem_solver.elasticity import SolidMeshError, element_stiffness
+from flexsheet.nodes.fem_solver.elasticity import SolidMeshError, element_stiffness, quadrature
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -57,3 +61,30 @@ def solve(stiffness: csc_matrix, fixed_dofs: Ints, values: Floats, loads: Floats
         raise SolidMeshError("the body is free to move: the stiffness is singular to rounding")
     result[free] = factor.solve(loads[free] - stiffness[free][:, fixed_dofs] @ values)
     return result
+
+
+def scikit_basis(nodes: Floats, elements: Ints) -> tuple[Any, Ints]:
+    """Return scikit-fem's basis on a curved mesh, and the index of each degree of freedom here.
+
+    The quadrature is that of the solver, so that only the assembly differs.
+    """
+    import skfem
+
+    corners = np.unique(elements[:, :4])
+    straight = nodes.copy()
+    straight[elements[:, 4:]] = nodes[elements[:, EDGES]].mean(axis=2)
+    tetrahedra = np.searchsorted(corners, elements[:, :4])
+    external = skfem.MeshTet2.from_mesh(skfem.MeshTet(straight[corners].T, tetrahedra.T))
+    distance, nearest = cKDTree(straight).query(external.doflocs.T)
+    assert distance.max() < 1e-12
+    external = skfem.MeshTet2(nodes[nearest].T, external.t)
+    points, weights = quadrature()
+    element = skfem.ElementVector(skfem.ElementTetP2())
+    basis = skfem.Basis(external, element, quadrature=(points.T, weights))
+    distance, node = cKDTree(nodes).query(basis.doflocs.T)
+    assert distance.max() < 1e-9
+    axis = np.empty(len(node), dtype=np.int64)
+    for names in (basis.nodal_dofs, basis.edge_dofs):
+        for number, dofs in enumerate(names):
+            axis[dofs] = number
+    return basis, 3 * node + axis

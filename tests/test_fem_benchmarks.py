@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import external_solvers
 from flexsheet.launch.health.compliance import SKIN_SPACING_M, compute_front_curve
 from flexsheet.messages.methods import SoftBodyChoice
 from flexsheet.messages.scene import Scene
@@ -71,40 +69,22 @@ def test_every_method_is_compared_with_a_finer_newton(
     assert reports[0][0] == 0
     assert reports[-1][0] == reports[-1][1]
     monkeypatch.setattr(reference, "local_processes", pytest.fail)  # what was solved is kept
-    external = external_solvers.external_trials(chart, chart.reference_set(), (0.003,))
     points = {
-        (p.method, p.case["depth_mm"]): p
-        for p in (measure(t, repeats=1) for t in (*chart.trials(), *external))
+        (p.method, p.case["depth_mm"]): p for p in (measure(t, repeats=1) for t in chart.trials())
     }
-    assert {method for method, _ in points} >= {
-        "linear",
-        "table",
-        NEWTON,
-        external_solvers.SCIKIT_FEM,
-    }
+    assert {method for method, _ in points} >= {"linear", "table", NEWTON}
     linear, table = points["linear", 3.0], points["table", 3.0]
     assert points["linear", 1.0].in_range
     assert points["linear", 1.0].error < 0.2
     assert not points["linear", 7.5].in_range
     assert abs(table.extra_metrics[FORCE]) < abs(linear.extra_metrics[FORCE])
     assert 0.0 < linear.reference_uncertainty["error"] < 1.0
-    # others get the same skin from the same forces
-    for solver in (external_solvers.SPARSE_FACTOR, external_solvers.SCIKIT_FEM):
-        assert points[solver, 3.0].error == pytest.approx(linear.error, rel=1e-3)
-        assert points[solver, 3.0].extra_metrics[FORCE] == pytest.approx(
-            linear.extra_metrics[FORCE]
-        )
     assert points[NEWTON, 3.0].error < 0.3
     assert points[NEWTON, 3.0].median_s > linear.median_s
     # so deep no mesh can be followed: nothing is said of the error, the skin is held
     deep = [points[method, 50.0] for method in ("linear", "table")]
     assert all(np.isnan(point.error) and not point.in_range for point in deep)
     assert all(point.extra_metrics[MAX_DISPLACEMENT] < 12.0 for point in deep)
-
-
-def test_a_solver_that_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "skfem", None)
-    assert external_solvers.import_optional("skfem") is None
 
 
 def test_the_objects_curve_does_not_depend_on_the_cache(

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from benchmarks.external_solvers import scikit_basis
 from flexsheet.nodes.fem_solver.elasticity import (
     SolidMeshError,
     element_stiffness,
 )
 from flexsheet.nodes.fem_solver.hyperelastic import InvertedElementError, NeoHookeanSolid
 from flexsheet.nodes.fem_solver.multifrontal import IndefiniteError, NestedDissection
+from tests.linear_elasticity import scikit_basis
 from tests.solids import box, distorted
 
 Floats = NDArray[np.float64]
@@ -109,7 +109,7 @@ def test_nonlinear_forces_tangent_and_solution_equal_those_of_scikit_fem() -> No
 
     nodes, elements = box((1, 2, 2), (1.0, 1.0, 2.0))
     solid = NeoHookeanSolid(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=NU)
-    basis, order = scikit_basis(skfem, nodes, elements)
+    basis, order = scikit_basis(nodes, elements)
 
     def stress(state: Any) -> Any:
         gradient = grad(state) + identity(grad(state))

@@ -11,14 +11,13 @@ import skfem
 from numpy.typing import NDArray
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from benchmarks.external_solvers import scikit_basis
 from flexsheet.nodes.fem_solver.elasticity import element_stiffness
 from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from tests.examples import long_except
 from tests.fem_fields import dofs_of, pressure_loads
 from tests.fem_verification import Record, at_most
-from tests.linear_elasticity import solve, stiffness_matrix
+from tests.linear_elasticity import scikit_basis, solve, stiffness_matrix
 from tests.scene_solids import SHAPES, scene_solid
 
 Floats = NDArray[np.float64]
@@ -30,7 +29,7 @@ E, NU, PRESSURE = 4000.0, 0.45, 50.0
 @cache
 def their_basis(shape: str) -> tuple[Any, Ints]:
     mesh = scene_solid(shape)
-    return scikit_basis(skfem, mesh.nodes, mesh.elements)
+    return scikit_basis(mesh.nodes, mesh.elements)
 
 
 @cache

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from benchmarks.planner_methods import ellipsoid_mesh
+from benchmarks.planner import ellipsoid_mesh
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.messages.scene import Mesh
 from flexsheet.nodes.models.rigid import angle_between

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.special import erf, ndtr
+from scipy.special import erf
 
-from benchmarks.fingertip_bound import BoundError, fingertip_bound, pixel_information
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.scene import Lens, Scene, StereoCamera
 from flexsheet.nodes.arrays import Image
@@ -27,7 +26,6 @@ from flexsheet.nodes.twin.clutter import (
     SecondMarker,
     Sheet,
     covered,
-    second_marker,
     together,
     touching_highlight,
 )
@@ -455,103 +453,3 @@ def test_no_clutter_is_similar_to_a_marker(rig: StereoCamera) -> None:
 def test_there_is_one_sheet() -> None:
     with pytest.raises(ValueError, match="2 sheets"):
         together(CLUTTER["lab"], CLUTTER["lab"])
-
-
-EVEN = Sensor(background_level=40.0, texture_level=0.0, noisy_backgrounds=1)
-
-
-BESIDE = np.array([0.05, 0.0, 0.0])
-
-
-@pytest.fixture(scope="module")
-def disc(rig: StereoCamera) -> TwinCamera:
-    """Return a marker on uniform ground, beside the finger."""
-    return looking(rig, sensor=EVEN).with_changes(marker_offset_m=BESIDE)
-
-
-def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera) -> None:
-    """With uniform noise n, contrast C, radius r and blur s << r, the variance is 2 s n^2 /
-    (sqrt(pi) r C^2).
-
-    The rim's gradient C g(d) n_x, squared, integrates over the rim to C^2 pi r / (2 sqrt(pi) s).
-    """
-    sensor = Sensor(
-        background_level=40.0, texture_level=0.0, photons_per_level=1e9, read_noise=3.0,
-        noisy_backgrounds=1, aperture_m=1e-6,
-    )  # fmt: skip
-    camera = looking(rig, sensor=sensor).with_changes(marker_radius_m=0.006, marker_offset_m=BESIDE)
-    bound = fingertip_bound(camera, still, exposure_s=0.0)
-    for eye, covariance in zip(camera.eyes, bound.views_px2, strict=True):
-        _, depth_m = eye.see(TIP + BESIDE)
-        radius_px = 0.006 * np.sqrt(eye.lens.fx_px * eye.lens.fy_px) / depth_m
-        noise_sq, spread_px = 9.0 + 1.0 / 12.0, np.sqrt(0.49 + 1.0 / 12.0)
-        rim = 2.0 * spread_px * noise_sq / (np.sqrt(np.pi) * radius_px * 175.0**2)
-        assert np.allclose(np.diag(covariance), rim, rtol=0.05)
-        assert abs(covariance[0, 1]) < 0.02 * rim
-
-
-def disc_misfit(p: Floats, image: Image, x0: int, y0: int) -> Floats:
-    """Return the misfit of a blurred disc (x, y, radius, blur, ground, height) in standard
-    deviations."""
-    y, x = np.mgrid[y0 - 8 : y0 + 9, x0 - 8 : x0 + 9]
-    inside = (p[2] - np.hypot(x - p[0], y - p[1])) / p[3]
-    level = p[4] + p[5] * ndtr(inside)
-    return np.asarray(((image[y, x] - level) / EVEN.noise(level.astype(np.float32))).ravel())
-
-
-@pytest.mark.long
-def test_a_most_likely_fit_reaches_the_bound_and_does_not_beat_it(disc: TwinCamera) -> None:
-    bound = fingertip_bound(disc, still, exposure_s=0.0)
-    place = disc.eyes[0].see(TIP + BESIDE)[0]
-    x0, y0 = np.rint(place).astype(int)
-    guess = np.array([*place, 3.2, 0.75, 40.0, 175.0])
-    found = []
-    for _ in range(200):
-        image, _ = disc.picture(still, exposure_s=0.0)
-        found.append(least_squares(disc_misfit, guess, args=(image, x0, y0)).x[:2] - place)
-    spread = np.mean(np.square(found - np.mean(found, axis=0)))
-    assert spread / np.mean(np.diag(bound.views_px2[0])) == pytest.approx(1.0, abs=0.15)
-
-
-def test_the_position_bound_follows_from_the_views(disc: TwinCamera) -> None:
-    """Along the view, the depth error is Z^2 / (f B) times that of the disparity."""
-    bound = fingertip_bound(disc, still, exposure_s=0.0)
-    eye = disc.eyes[0]
-    _, depth_m = eye.see(TIP + BESIDE)
-    along = eye.camera_from_world[2, :3]
-    disparity_px = np.sqrt(sum(view[0, 0] for view in bound.views_px2))
-    expected_m = depth_m**2 / (eye.lens.fx_px * 0.1205) * disparity_px
-    assert np.sqrt(along @ bound.position_m2 @ along) == pytest.approx(expected_m, rel=0.15)
-
-
-def test_the_bound_widens_with_defocus_speed_and_saturation(disc: TwinCamera) -> None:
-    def size(camera: TwinCamera, speed_m_per_s: float = 0.0) -> float:
-        way = np.array([speed_m_per_s, 0.0, 0.0])
-        bound = fingertip_bound(camera, lambda s: TIP + s * way, exposure_s=0.004)
-        return float(np.sqrt(np.trace(bound.position_m2)))
-
-    plain = size(disc)
-    blurred = Sensor(background_level=40.0, texture_level=0.0, blur_px=2.5)
-    assert size(disc.with_changes(sensor=blurred)) > 1.5 * plain
-    assert size(disc, 1.5) > 1.2 * plain
-    dim = Sensor(background_level=40.0, texture_level=0.0, marker_level=100.0)
-    assert size(disc.with_changes(sensor=dim)) > 2.0 * plain
-
-
-def test_a_saturated_pixel_has_no_information_and_a_dark_one_all_of_it() -> None:
-    sensor = Sensor()
-    reported = pixel_information(sensor, np.array([100.0, 230.0, 255.0, 300.0]))
-    noise_sq = np.array([100.0, 230.0, 255.0]) / 40.0 + 2.25 + 1.0 / 12.0
-    assert reported[:2] == pytest.approx(1.0 / noise_sq[:2], rel=1e-6)
-    # At its mean, a cut normal keeps 1/2 + 1/pi of the information.
-    assert reported[2] * noise_sq[2] == pytest.approx(0.5 + 1.0 / np.pi, rel=1e-6)
-    assert reported[3] < 1e-12
-
-
-def test_there_is_no_bound_if_the_marker_is_not_visible(rig: StereoCamera) -> None:
-    for place, printed in (([0.0, 0.25, 0.9], "behind"), ([0.6, 0.0, 0.0], "outside the")):
-        with pytest.raises(BoundError, match=printed):
-            fingertip_bound(looking(rig), lambda _, p=place: np.array(p), exposure_s=0.004)
-    with pytest.raises(BoundError, match="right view"):
-        fingertip_bound(looking(rig, covered(1.0, views="right")), still, exposure_s=0.004)
-    assert fingertip_bound(looking(rig, second_marker((0.03, 0.0, 0.0))), still, exposure_s=0.004)

@@ -428,7 +428,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
     errors_moving = 100.0 * np.array([one.error_ratio for one in moving])
     return {
         "rows": resting,
-        "reference": "independent finite elements (benchmarks.force_reference)"
+        "reference": "independent finite elements (experiments/force_reference.json)"
         if compared
         else "the soft body's own force, because no independent solution fits the scene",
         "median_percent": float(np.median(errors)),

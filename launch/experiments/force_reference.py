@@ -1,6 +1,6 @@
 """Read stored curves of force against depth that an independent solver computed for a cylinder.
 
-`benchmarks.force_reference` computes the curves and describes the method. They are dimensionless:
+The stored file names method and commit of the solver. The curves are dimensionless:
 lengths are in finger radii, forces in Young's modulus times the squared finger radius. Therefore
 each curve is valid for all scenes with the same proportions.
 """
