@@ -1,12 +1,75 @@
-"""Define the notes of nodes, with the meanings and remedies that `flexsheet explain` prints."""
+"""Define the notes that nodes publish in their status: a code, and a detail for people."""
 
 from __future__ import annotations
 
-from enum import Enum
+from collections.abc import Iterable
+from enum import Enum, StrEnum
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # the import takes longer than `flexsheet explain` may take
+from pydantic import Field
+
+from flexsheet.messages.base import MessagePart
+
+if TYPE_CHECKING:
     from flexsheet.messages.types import FingertipReason, SelfCheck, SheetReason, SuspectedCause
+
+
+class NoteCode(StrEnum):
+    """The kind of a note. `REMEDIES` states what to do about each kind except INFO."""
+
+    INFO = "info"
+    WAITING_FOR_SCENE = "waiting-for-scene"
+    ARM_DISCONNECTED = "arm-disconnected"
+    ARM_ESTOP = "arm-estop"
+    ARM_FAULT = "arm-fault"
+    ARM_NOT_ENABLED = "arm-not-enabled"
+    ARM_PATH_BLOCKED = "arm-path-blocked"
+    ARM_WAITS = "arm-waits"
+    CAMERA_SETTINGS = "camera-settings"
+    COMMANDS_UNANSWERED = "commands-unanswered"
+    FINGERTIPS_LATE = "fingertips-late"
+    FINGER_PATH_REFUSED = "finger-path-refused"
+    FORCE_NOT_POSSIBLE = "force-not-possible"
+    FORCE_TABLE_MISSING = "force-table-missing"
+    FRAME_NOT_RENDERED = "frame-not-rendered"
+    FRAMES_MISSED = "frames-missed"
+    HAND_CAN_OSCILLATE = "hand-can-oscillate"
+    NO_IMAGES = "no-images"
+    NO_PROJECTOR = "no-projector"
+    NOT_RECORDING = "not-recording"
+    OBJECT_TOO_SOFT = "object-too-soft"
+    OSCILLATIONS_STOPPED = "oscillations-stopped"
+    PAIRS_REJECTED = "pairs-rejected"
+    SHEET_FOLDED = "sheet-folded"
+    SHEET_PLANE_OLD = "sheet-plane-old"
+    SHEET_SHAPE_INACCURATE = "sheet-shape-inaccurate"
+    SHEET_SHAPES_MISSING = "sheet-shapes-missing"
+    SOFT_BODY_COMPUTING = "soft-body-computing"
+    SOFT_BODY_FAILED = "soft-body-failed"
+    SOURCE_ENDED = "source-ended"
+    STAMPED_ON_ARRIVAL = "stamped-on-arrival"
+    TABLE_MISSING = "table-missing"
+    WINDOW_CLOSED = "window-closed"
+    WINDOW_LOST = "window-lost"
+    WINDOW_SIZE = "window-size"
+
+
+class Note(MessagePart):
+    """A state or a problem of a node."""
+
+    code: NoteCode = NoteCode.INFO
+    detail: str = Field(default="", description="text for people, which programs do not evaluate")
+
+    def __str__(self) -> str:
+        if self.code is NoteCode.INFO:
+            return self.detail
+        return f"{self.code}: {self.detail}" if self.detail else self.code
+
+
+def describe_notes(notes: Iterable[Note]) -> str:
+    """Return the text of a node's notes, on one line."""
+    return "; ".join(map(str, notes))
+
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
 NO_ACTION = "No action is needed."

@@ -30,6 +30,7 @@ from flexsheet.messages.arrays import (
     Vector6,
 )
 from flexsheet.messages.base import Message, MessagePart, Stamp
+from flexsheet.messages.notes import Note
 from flexsheet.messages.scene import Finite, NonNegative, Positive
 
 Correction = methods.Correction
@@ -619,7 +620,7 @@ class Status(Message):
     outputs: tuple[PortStatus, ...]
     errors: int = Field(ge=0)
     last_error: str
-    note: str = Field(description="message of the node to the operator, one line")
+    notes: tuple[Note, ...] = ()
     plan_hash: str
     clock_id: str = ""
     clock_offsets: tuple[ClockOffset, ...] = Field(

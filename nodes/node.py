@@ -48,6 +48,7 @@ from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.notes import Note, NoteCode, describe_notes
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import ArmState, ParameterChange, PortStatus, SelfCheck, Status
@@ -398,7 +399,7 @@ class Node:
         self.errors = 0
         self.last_error = ""
         self.reported_problems = 0
-        self.note = ""
+        self.notes: tuple[Note, ...] = ()
         self.changed_parameters: dict[str, Any] = {}
         self.self_checks: tuple[SelfCheck, ...] = ()
         self.started_ns = clock.now_ns()
@@ -523,6 +524,19 @@ class Node:
         if not self.opens_devices:
             self.execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
+
+    def set_note(self, code: NoteCode, detail: str = "") -> None:
+        """Replace the notes in the node's status by one note."""
+        self.notes = (Note(code=code, detail=detail),)
+
+    @property
+    def note(self) -> str:
+        """Return the text of the notes."""
+        return describe_notes(self.notes)
+
+    @note.setter
+    def note(self, text: str) -> None:
+        self.notes = (Note(detail=text),) if text else ()
 
     def report_error(self, what: str, error: Exception) -> None:
         """Count an error, report it in the status message, and log it.

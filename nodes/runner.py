@@ -286,7 +286,7 @@ def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
         outputs=tuple(port.counts.status(port.topic, node.clock) for port in node.outputs.values()),
         errors=node.errors,
         last_error=node.last_error,
-        note=node.note,
+        notes=node.notes,
         plan_hash=node.plan_hash,
         clock_id=node.clock.id,
         clock_offsets=tuple(node.clock_table.offsets.values()),

@@ -38,7 +38,6 @@ def status_of(node: str, **changes: Any) -> Status:
         "outputs": (),
         "errors": 0,
         "last_error": "",
-        "note": "",
         "plan_hash": "",
     }
     return Status(**values | changes)

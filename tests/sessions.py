@@ -13,6 +13,7 @@ from flexsheet.launch.experiments.stroke import stroke_label, stroke_window_s
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.notes import Note
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
@@ -136,7 +137,8 @@ def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
                           gaps=2, rejected=1)  # fmt: skip
         status = Status(node="planner", state="degraded", pid=1, uptime_s=1.0, cpu_ratio=0.25,
                         resident_bytes=10**8, inputs=(port,), outputs=(), errors=3,
-                        last_error="on_fingertip: bang", note="strokes", plan_hash="")  # fmt: skip
+                        last_error="on_fingertip: bang",
+                        notes=(Note(detail="strokes"),), plan_hash="")  # fmt: skip
         desk.write("status", status, 2.5)
     return path
 

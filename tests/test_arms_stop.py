@@ -29,6 +29,7 @@ from flexsheet.launch.running.stopping import (
     StopPath,
     stop_arms,
 )
+from flexsheet.messages.notes import Note
 from flexsheet.nodes import stop_socket
 from flexsheet.nodes.stop_socket import MAX_CONNECTIONS, StopSocket
 from tests.console_parts import status_of
@@ -162,8 +163,8 @@ async def test_a_bridge_without_its_arm_states_the_reason() -> None:
     plan = load_graph(ROOT / "launch" / "demo.yaml")
     arms = arms_command._Arms(plan, Run("unused", Path("unused")))
     note = "waiting for the arm: no connection to 127.0.0.1:5099"
-    arms._on_message(status_of("arm_left_bridge", note=note), None)
-    arms._on_message(status_of("planner", note="follows the finger"), None)
+    arms._on_message(status_of("arm_left_bridge", notes=(Note(detail=note),)), None)
+    arms._on_message(status_of("planner", notes=(Note(detail="follows the finger"),)), None)
     rows = arms_command._rows(arms.states, arms.notes)
     assert [row["reason"] for row in rows] == [note, "no message from the bridge"]
 

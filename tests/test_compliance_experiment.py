@@ -33,6 +33,7 @@ from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.notes import Note
 from flexsheet.messages.types import SoftBody, Status
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
@@ -237,7 +238,7 @@ class Bench:
             outputs=(),
             errors=int(bool(error)),
             last_error=error,
-            note=note,
+            notes=(Note(detail=note),),
             plan_hash="",
         )
         self.deliver("status", status)

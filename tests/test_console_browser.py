@@ -16,6 +16,7 @@ import pytest
 from playwright.async_api import Page as BrowserTab
 from playwright.async_api import async_playwright, expect
 
+from flexsheet.messages.notes import Note
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.console.access_control import start_server
@@ -82,7 +83,9 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: PageVisit) 
     page.show_problem(MARKUP)
     page.record.show_bags((f"{MARKUP}.mcap",))
     page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)
-    broken = status_of(MARKUP, note=MARKUP, errors=1, last_error=MARKUP, outputs=(port("stereo"),))
+    broken = status_of(
+        MARKUP, notes=(Note(detail=MARKUP),), errors=1, last_error=MARKUP, outputs=(port("stereo"),)
+    )
     statuses = {MARKUP: (broken, 0.0)}
     tables = panels.make_topics_table(statuses) + panels.make_nodes_table(statuses)
     page.graph.show(tables, History().columns())

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.notes import Note
 from flexsheet.messages.types import Display, FingerPath, Recording
 from flexsheet.nodes.console.access_control import start_server
 from flexsheet.nodes.console.controller import (
@@ -196,7 +197,7 @@ async def test_own_display_messages_are_known_by_their_writer(
 async def test_notes_come_from_the_nodes_of_the_plan_with_any_names(bench: Bench) -> None:
     for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
         bench.operator.on_message(
-            status_of(name, note=note), Header(1, 1, 1, "clock", name, 1), 0.0
+            status_of(name, notes=(Note(detail=note),)), Header(1, 1, 1, "clock", name, 1), 0.0
         )
     bench.run(0.5)
     assert "recording to a.mcap" in bench.operator._page.record._text.content

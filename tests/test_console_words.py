@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flexsheet.messages.notes import Note
 from flexsheet.messages.types import ArmState, PortStatus
 from flexsheet.nodes.console import banner, html_head, panels
 from flexsheet.nodes.console.banner import BannerState, GraphState
@@ -162,7 +163,7 @@ def test_names_with_markup_are_shown_as_text() -> None:
         rendered(arms=arms_in(mode="fault", faults=(evil,), reason=evil)),
         rendered(arms=blocked, overload=evil, solver_note=evil),
         panels.make_nodes_table(
-            {evil: (status_of(evil, note=evil, errors=1, last_error=evil), 0.0)}
+            {evil: (status_of(evil, notes=(Note(detail=evil),), errors=1, last_error=evil), 0.0)}
         ),
         panels.make_topics_table({evil: (status_of(evil, outputs=(port("stereo"),)), 0.0)}),
         panels.problem(evil),

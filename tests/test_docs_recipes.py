@@ -39,7 +39,7 @@ async def main():
         note, checks = "", ()
         async for status, header in flexsheet.read_topic(graph, "status"):
             if header.writer == "guard":
-                note = status.note
+                note = status.notes[0].detail if status.notes else ""
             elif header.writer == "triangulator":
                 checks = status.self_checks
             if note and checks:

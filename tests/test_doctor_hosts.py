@@ -35,6 +35,7 @@ from flexsheet.launch.running.keys import KEYS_VARIABLE, secret_file
 from flexsheet.launch.running.runs import HOST_FILE, Run
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bus import Publisher
+from flexsheet.messages.notes import Note
 from flexsheet.messages.security import make_key_pair, write_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
@@ -84,7 +85,8 @@ def port(topic: str, rate_hz: float, *, rejected: int = 0) -> PortStatus:
 def make_status(node: str, *outputs: PortStatus, note: str = "", inputs: Any = ()) -> Status:
     return Status(
         node=node, state="running", pid=1, uptime_s=9.0, cpu_ratio=0.1, resident_bytes=1,
-        inputs=tuple(inputs), outputs=outputs, errors=0, last_error="", note=note, plan_hash="",
+        inputs=tuple(inputs), outputs=outputs, errors=0, last_error="",
+        notes=(Note(detail=note),), plan_hash="",
     )  # fmt: skip
 
 

@@ -548,7 +548,7 @@ def test_suspected_causes_are_read_from_the_status_messages(tmp_path: Path) -> N
         for number, found in enumerate(checks, start=1):
             status = Status(
                 node="planner", state="running", pid=1, uptime_s=1.0, cpu_ratio=0.1,
-                resident_bytes=1, inputs=(), outputs=(), errors=0, last_error="", note="",
+                resident_bytes=1, inputs=(), outputs=(), errors=0, last_error="",
                 plan_hash="plan", self_checks=found,
             )  # fmt: skip
             at_ns = 1_000_000_000 * number

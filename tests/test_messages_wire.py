@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, create_model
 
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.base import Header, Message, compute_fingerprint
+from flexsheet.messages.notes import Note, NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, Fingertip, Frame, PortStatus, Skin, Status, StereoPair
@@ -87,7 +88,7 @@ statuses = st.builds(
     outputs=st.lists(ports, max_size=3).map(tuple),
     errors=st.integers(0, 5),
     last_error=st.text(max_size=30),
-    note=st.text(max_size=30),
+    notes=st.tuples(st.builds(Note, code=st.sampled_from(NoteCode), detail=st.text(max_size=30))),
     plan_hash=st.text(max_size=10),
 )
 stops = st.builds(EStop, engaged=st.booleans(), reason=st.text(max_size=50))

@@ -287,7 +287,7 @@ def test_a_controller_that_ends_before_its_bridge_is_no_fault(
     bag = tmp_path / "end.mcap"
     lost = arm_state("left", mode="disconnected", reason="no answer", faults=("no answer",))
     running = Status(node="bridge", state="running", pid=1, uptime_s=1.0, cpu_ratio=0.0,
-                     resident_bytes=1, inputs=(), outputs=(), errors=0, last_error="", note="",
+                     resident_bytes=1, inputs=(), outputs=(), errors=0, last_error="",
                      plan_hash="")  # fmt: skip
     with BagWriter(bag, {"recording": {"clock_id": "clock"}}) as writer:
         desk = sessions.MessageWriter(writer, ())

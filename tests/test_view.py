@@ -352,7 +352,7 @@ URDF = "/robot_description"
 def make_status() -> Status:
     return Status(
         node="planner", state="running", pid=1, uptime_s=1.0, cpu_ratio=0.0, resident_bytes=1,
-        inputs=(), outputs=(), errors=0, last_error="", note="", plan_hash="", clock_id="",
+        inputs=(), outputs=(), errors=0, last_error="", plan_hash="", clock_id="",
         clock_offsets=(), execution_log=np.zeros((0, 4), np.int64), self_checks=(),
         changed_parameters='{"max_spin_rad": 0.5}',
     )  # fmt: skip

@@ -32,7 +32,12 @@ from flexsheet.launch.running.host import (
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
 from flexsheet.messages.busy import describe_busy, describe_busy_remedy, describe_pressure, is_busy
-from flexsheet.messages.notes import SELF_CHECK_REMEDIES, NodeNote, describe_self_check
+from flexsheet.messages.notes import (
+    SELF_CHECK_REMEDIES,
+    NodeNote,
+    describe_notes,
+    describe_self_check,
+)
 from flexsheet.messages.scene import Scene, shows_check_marks
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
@@ -448,7 +453,7 @@ def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[
             yield HostFinding(host, check, "failed", what, "see the node's log")
             continue
         sent = max((one.rate_hz for one in status.outputs if one.topic != "status"), default=0.0)
-        what = f"{sent:.0f} Hz; {status.note or 'no note'}"
+        what = f"{sent:.0f} Hz; {describe_notes(status.notes) or 'no note'}"
         if sent > 0.0:
             yield HostFinding(host, check, "ok", what)
         else:
@@ -489,7 +494,9 @@ def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostF
     starts = any(one.state == "starting" for one in probe.status.nodes)
     where = "" if node.device_address is None else f" at {node.device_address}"
     remedy = f"check that the controller{where} is on and its program runs; see the node's log"
-    return HostFinding(probe.host, check, "warning" if starts else "failed", status.note, remedy)
+    return HostFinding(
+        probe.host, check, "warning" if starts else "failed", describe_notes(status.notes), remedy
+    )
 
 
 def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
