@@ -37,7 +37,6 @@ from zmq.utils.monitor import parse_monitor_message
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.local_bus import LocalBus, LocalConnection
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyRing, ZapAuthenticator
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
@@ -109,9 +108,9 @@ enough, because libzmq 4.3.5 stops waiting for the next heartbeat as soon as a m
 """
 
 HANDSHAKE_FAILED: dict[int, str] = {
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH: NodeNote.KEY_REFUSED.phrase,
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: NodeNote.NO_KEYS_THERE.phrase,
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: NodeNote.KEY_NOT_PROVED.phrase,
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "rejects the key of this host; check its launch file",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not accept keys; its launch file may have none",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "did not prove that it has its key",
 }
 RECONNECTED = (zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECT_RETRIED)
 MONITORED_EVENTS = zmq.EVENT_DISCONNECTED | sum(RECONNECTED) | sum(HANDSHAKE_FAILED)
@@ -521,7 +520,7 @@ class Subscriber:
             self._report_gaps_from = 2 * self.counts.gaps
             self.on_problem(
                 f'topic "{self.topic.name}": {lost} messages of {writer} were lost, '
-                f"{self.counts.gaps} in total; {NodeNote.READER_TOO_SLOW.phrase}"
+                f"{self.counts.gaps} in total; a subscriber or the network is too slow"
             )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
@@ -43,7 +42,7 @@ def describe_busy(host: HostStatus) -> str:
         why = f"{host.load_ratio:.1f} runnable processes per core"
     else:
         why = describe_pressure(host.cpu)
-    return f"the computer {host.host} {NodeNote.COMPUTER_BUSY.phrase} {why}"
+    return f"the computer {host.host} is busy: {why}"
 
 
 def describe_pressure(cpu: CpuPressure) -> str:

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import TypeVar
 
 from flexsheet.messages.base import Header, Message, find_stamp_fields
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ClockOffset, Clocks
 
 M = TypeVar("M", bound=Message)
@@ -44,14 +43,14 @@ class ClockTable:
             return ""
         offset = self.offsets.get(clock_id)
         if offset is None:
-            return f"clock {clock_id} {NodeNote.CLOCK_NOT_MEASURED.phrase}"
+            return f"clock {clock_id} is not measured"
         aged_s = self._max_drift * max(0, now_ns - offset.at_ns) * 1e-9
         uncertainty_s = offset.uncertainty_s + aged_s
         if uncertainty_s <= self._limit_s:
             return ""
         return (
             f"clock {clock_id} has an uncertainty of {1e3 * uncertainty_s:.3g} ms, "
-            f"{1e3 * self._limit_s:.3g} {NodeNote.CLOCK_UNCERTAIN.phrase}"
+            f"{1e3 * self._limit_s:.3g} ms are allowed"
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:

@@ -639,6 +639,11 @@ class Status(Message):
         default="{}", description="parameters changed since the start, as a JSON object"
     )
 
+    @property
+    def note_text(self) -> str:
+        """Return the notes for people, on one line."""
+        return "; ".join(map(str, self.notes))
+
 
 class ParameterChange(Message):
     """A request to change a parameter of a running node (`flexsheet param set`)."""

@@ -48,7 +48,7 @@ from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.limits import LimitedModel
-from flexsheet.messages.notes import Note, NoteCode, describe_notes
+from flexsheet.messages.notes import Note, NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import ArmState, ParameterChange, PortStatus, SelfCheck, Status
@@ -532,7 +532,7 @@ class Node:
     @property
     def note(self) -> str:
         """Return the text of the notes."""
-        return describe_notes(self.notes)
+        return "; ".join(map(str, self.notes))
 
     @note.setter
     def note(self, text: str) -> None:

@@ -30,7 +30,6 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import BusError, MessageFilter, Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.local_bus import LocalBus
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
@@ -219,7 +218,7 @@ class NodeTransport:
             if not permits or header.writer in allowed:
                 return None
             return (
-                f"{header.writer} {NodeNote.MAY_NOT_RESET.phrase} or enable the arms; set "
+                f"{header.writer} may not reset an e-stop or enable the arms; set "
                 "hosts.NAME.may_reset_estop of its host in the launch file"
             )
 

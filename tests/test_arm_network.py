@@ -17,7 +17,6 @@ import pytest
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Source, Subscriber
-from flexsheet.messages.notes import describe_notes
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import ArmState, Clocks, Status
 from flexsheet.nodes.node import PortCounts
@@ -43,7 +42,7 @@ class Watch:
     notes: dict[str, str] = field(default_factory=dict)
 
     def take_status(self, status: Status, _: Header) -> None:
-        self.notes[status.node] = describe_notes(status.notes)
+        self.notes[status.node] = status.note_text
 
     def take_clocks(self, host: str, clocks: Clocks, header: Header) -> None:
         self.clocks[host] = clocks, header.clock_id

@@ -18,9 +18,9 @@ from pydantic import ValidationError
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import ArmState, SheetTarget, SheetTrajectory
+from flexsheet.nodes.arm_bridge.control import OTHER_BRIDGE_ENDED, PLANNER_ENDED
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import (
     FOLLOW_BOUNDS,
@@ -426,13 +426,13 @@ async def test_both_arms_brake_at_once_when_the_planner_ends(sides: tuple[str, .
     for side in sides:
         states = pair.states[side][began:]
         assert [state.mode for state in states] == ["hold"] * len(states)
-        assert {state.reason for state in states} == {NodeNote.PLANNER_ENDED.phrase}
+        assert {state.reason for state in states} == {PLANNER_ENDED}
     await pair.run(0.4, pair.targets())
     ends = {states[-1].mode for states in pair.states.values()}
     assert ends == {"idle"}
     assert {pair.states[side][-1].reason for side in sides} <= {
-        NodeNote.PLANNER_ENDED.phrase,
-        "other arm: " + NodeNote.PLANNER_ENDED.phrase,
+        PLANNER_ENDED,
+        "other arm: " + PLANNER_ENDED,
     }
     # New targets of a planner that has started again.
     pair.network.send = before  # type: ignore[method-assign]
@@ -452,7 +452,7 @@ async def test_an_arm_brakes_at_once_when_the_other_bridge_ends() -> None:
     await pair.run(0.3, pair.targets())
     states = pair.states["left"][began:]
     assert {state.mode for state in states[:4]} == {"hold"}
-    assert {state.reason for state in states[:4]} == {NodeNote.OTHER_BRIDGE_ENDED.phrase}
+    assert {state.reason for state in states[:4]} == {OTHER_BRIDGE_ENDED}
     assert states[-1].mode == "idle"
     assert not states[-1].ready
     assert not any(state.faults for state in states)

@@ -299,13 +299,12 @@ class _Arms:
             subscriber.close()
 
     def _on_message(self, message: Any, _: Any) -> None:
-        from flexsheet.messages.notes import describe_notes
         from flexsheet.messages.types import Status
 
         if isinstance(message, Status):
             node = self._plan.nodes.get(message.node)
             if node is not None and node.arm_side is not None:
-                self.notes[node.arm_side] = message.last_error or describe_notes(message.notes)
+                self.notes[node.arm_side] = message.last_error or message.note_text
         else:
             self.states[message.side] = message
             self._received_s[message.side] = self._loop.time()

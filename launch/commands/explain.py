@@ -60,7 +60,6 @@ def entries() -> tuple[Entry, ...]:
         SELF_CHECK_REMEDIES,
         SHEET_REASON_REMEDIES,
         SHEET_REASON_TEXTS,
-        NodeNote,
     )
 
     tables: tuple[tuple[dict[Any, str], dict[Any, str]], ...] = (
@@ -69,7 +68,6 @@ def entries() -> tuple[Entry, ...]:
     )
     return (
         *_error_entries(),
-        *(Entry(one.code, one.meaning, one.remedy, phrase=one.phrase) for one in NodeNote),
         *(
             Entry(code, FINGERTIP_REASON_TEXTS[code], remedy)
             for code, remedy in FINGERTIP_REMEDIES.items()

@@ -154,8 +154,6 @@ def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
 
     If the status is unknown, the values of the row are None.
     """
-    from flexsheet.messages.notes import describe_notes
-
     row: dict[str, Any] = {"node": node.name, "host": node.host}
     if status is None:
         unknown = dict.fromkeys(("cpu", "memory_mb", "skipped", "lost"))
@@ -172,7 +170,7 @@ def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
         "inputs": [port.model_dump() for port in status.inputs],
         "outputs": [port.model_dump() for port in status.outputs if port.messages],
         "errors": status.errors,
-        "note": status.last_error if status.state == "degraded" else describe_notes(status.notes),
+        "note": status.last_error if status.state == "degraded" else status.note_text,
     }
 
 

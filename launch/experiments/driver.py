@@ -23,7 +23,6 @@ from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
 from flexsheet.messages.busy import describe_busy
-from flexsheet.messages.notes import describe_notes
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     ArmState,
@@ -192,7 +191,7 @@ class Driver:
                 self._skin_source_ns = header.source_ns
                 self._newest.pop("soft_body", None)
             if isinstance(message, Status):
-                self._notes[message.node] = describe_notes(message.notes) or message.last_error
+                self._notes[message.node] = message.note_text or message.last_error
             if isinstance(message, ArmState):
                 self._count_settled()
             if isinstance(message, HostStatus):
@@ -336,7 +335,7 @@ class Driver:
             if message.errors:
                 failures.append(f'node "{message.node}": {message.last_error}')
             if time.monotonic() - reported_s >= PROGRESS_PERIOD_S:
-                progress(describe_notes(message.notes))
+                progress(message.note_text)
                 reported_s = time.monotonic()
 
         previous, self.on_message = self.on_message, watch

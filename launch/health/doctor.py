@@ -20,7 +20,6 @@ from flexsheet.launch.running.cpu import CpuWatch
 from flexsheet.launch.running.priority import min_node_nice
 from flexsheet.launch.running.runs import find_orphans, is_free, list_live_runs, root
 from flexsheet.messages.busy import MAX_LOAD_RATIO, describe_busy_remedy, describe_pressure
-from flexsheet.messages.notes import NodeNote
 
 DEMO = Path(__file__).parent.parent / "demo.yaml"
 CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
@@ -89,7 +88,7 @@ def check_load() -> Finding:
     else:
         text, busy = describe_pressure(pressure), pressure.busy
     if busy:
-        what = f"this computer {NodeNote.COMPUTER_BUSY.phrase} {text}"
+        what = f"this computer is busy: {text}"
         remedy = describe_busy_remedy(nice_denied=min_node_nice() >= 0)
         return Finding("load", "warning", what, remedy)
     return Finding("load", "ok", text)

@@ -32,12 +32,7 @@ from flexsheet.launch.running.host import (
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
 from flexsheet.messages.busy import describe_busy, describe_busy_remedy, describe_pressure, is_busy
-from flexsheet.messages.notes import (
-    SELF_CHECK_REMEDIES,
-    NodeNote,
-    describe_notes,
-    describe_self_check,
-)
+from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
 from flexsheet.messages.scene import Scene, shows_check_marks
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
@@ -338,7 +333,7 @@ def _check_clocks(
             )
     if not texts:
         return finding("not asked", "no other host reports")
-    what = f"{'; '.join(texts)}; {1e3 * limit_s:g} {NodeNote.CLOCK_UNCERTAIN.phrase}"
+    what = f"{'; '.join(texts)}; {1e3 * limit_s:g} ms are allowed"
     if bad:
         return finding("failed", what, "check chrony and the load of the network: docs/clocks.md")
     return finding("ok", what)
@@ -453,7 +448,7 @@ def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[
             yield HostFinding(host, check, "failed", what, "see the node's log")
             continue
         sent = max((one.rate_hz for one in status.outputs if one.topic != "status"), default=0.0)
-        what = f"{sent:.0f} Hz; {describe_notes(status.notes) or 'no note'}"
+        what = f"{sent:.0f} Hz; {status.note_text or 'no note'}"
         if sent > 0.0:
             yield HostFinding(host, check, "ok", what)
         else:
@@ -494,9 +489,8 @@ def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostF
     starts = any(one.state == "starting" for one in probe.status.nodes)
     where = "" if node.device_address is None else f" at {node.device_address}"
     remedy = f"check that the controller{where} is on and its program runs; see the node's log"
-    return HostFinding(
-        probe.host, check, "warning" if starts else "failed", describe_notes(status.notes), remedy
-    )
+    state: Literal["warning", "failed"] = "warning" if starts else "failed"
+    return HostFinding(probe.host, check, state, status.note_text, remedy)
 
 
 def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:

@@ -30,7 +30,6 @@ from flexsheet.messages.bus import Handler, Publisher, Source, Subscriber
 from flexsheet.messages.busy import describe_busy, describe_busy_remedy, is_busy
 from flexsheet.messages.clock import Clock, SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import (
@@ -395,7 +394,7 @@ class HostAgent:
 
 
 def _describe_estop(writer: str, reason: str) -> str:
-    return f"e-stop of {writer}, {NodeNote.ESTOP_KEPT.phrase}: {reason}"
+    return f"e-stop of {writer}, latched until it is reset: {reason}"
 
 
 def make_output(

@@ -69,7 +69,6 @@ from flexsheet.messages.bus import Publisher
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import find_topic
@@ -703,7 +702,7 @@ class RunningGraph:
             return f"was not ready within {process.start_deadline_s:g} s"
         if hangs:
             seconds = process.settings.liveness_s
-            missing = f"{NodeNote.NODE_HUNG.phrase} for {seconds:g} s"
+            missing = f"hung: no heartbeat for {seconds:g} s"
             return f"{missing}; its log contains the call stacks"
         return describe_exit(code)
 

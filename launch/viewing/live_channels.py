@@ -46,7 +46,6 @@ from flexsheet.launch.viewing.foxglove_drawing import (
 )
 from flexsheet.launch.viewing.json_channel import make_schema, to_json
 from flexsheet.messages.base import Message
-from flexsheet.messages.notes import describe_notes
 from flexsheet.messages.scene import Lens, Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import (
@@ -340,7 +339,7 @@ def _make_log(_: LiveState, message: Message | None, stamp: Any) -> Any:
         case EStop():
             return make_estop_log(message, stamp, "estop")
         case Status() if message.state == "degraded" or message.notes:
-            text = describe_notes(message.notes) or message.last_error or message.state
+            text = message.note_text or message.last_error or message.state
             level = fg.LogLevel.Warning
             return fg.Log(timestamp=stamp, level=level, message=text, name=message.node)
     return None

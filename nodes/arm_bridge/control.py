@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import Arming, ArmMode, EStop
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import (
@@ -61,6 +60,9 @@ from flexsheet.nodes.models.motion import (
     follow_sheet,
 )
 from flexsheet.nodes.models.rigid import is_rigid
+
+PLANNER_ENDED = "the connection to the planner has ended"
+OTHER_BRIDGE_ENDED = "the connection to the other arm's bridge has ended"
 
 MAX_REST_RAD_PER_S = 1e-6
 """The maximum joint speed at which an arm is considered to be at rest."""
@@ -269,7 +271,7 @@ class ArmControl:
         """
         if silent and self.last_measured_rad is None:
             # The arm has never answered, so it may still be starting, which is no fault.
-            self.reason = f"{NodeNote.WAITING_FOR_ARM.phrase}: {text}"
+            self.reason = f"waiting for the arm: {text}"
             return False
         if silent and self.on_answer_missed(text):
             return False
@@ -307,7 +309,7 @@ class ArmControl:
         if arm_faults == (ArmFault.WATCHDOG,):
             # A command was late, so the arm has stopped: restart from its position.
             self._restart_idle()
-            self.reason = NodeNote.ARM_WATCHDOG.phrase
+            self.reason = "the arm's watchdog stopped it"
             self._inhibit(self.reason, Event.WATCHDOG_TRIPPED)
         elif arm_faults and not self.faults:
             self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
@@ -439,8 +441,7 @@ class ArmControl:
         ):
             if goal is None:
                 return "waiting for a sheet target"
-            note = NodeNote.PLANNER_ENDED if goal.planner_ended else NodeNote.NO_SHEET_TARGET
-            return note.phrase
+            return PLANNER_ENDED if goal.planner_ended else "no sheet target"
         return None
 
     def _settle(self) -> None:
@@ -474,10 +475,9 @@ class ArmControl:
             return self._send("idle", self.commanded_rad)
         self.handle(Event.CONNECTED)
         if other is None:
-            self._silence = NodeNote.WAITING_FOR_OTHER_ARM.phrase
+            self._silence = "waiting for the other arm"
         else:
-            note = NodeNote.OTHER_BRIDGE_ENDED if other.ended else NodeNote.OTHER_ARM_SILENT
-            self._silence = note.phrase
+            self._silence = OTHER_BRIDGE_ENDED if other.ended else "the other arm is silent"
         if other is not None and (invalid := other.invalid_reason) is not None:
             self._silence, other = f"state of the other arm: {invalid}", None
         self._check_measurement(other, measured)
@@ -555,10 +555,10 @@ class ArmControl:
         is_late = goal.planner_ended or other.ended or late_s > self._timeouts.hold_after_s
         self.handle(Event.LATE if is_late else Event.IN_TIME)
         if is_late:
-            self.reason = _find_late_note(goal, other).phrase
+            self.reason = _find_late_reason(goal, other)
         else:
             self._together = self._together or other.mode == "follow"
-            self.reason = "" if self._together else NodeNote.FOLLOWS_OTHER_ARM.phrase
+            self.reason = "" if self._together else "waits for the other arm"
         if self._alignment is not None:
             return self._align(self._alignment, other)
         if is_late:
@@ -639,7 +639,7 @@ class ArmControl:
         self._relaxed_limits = self._geometry.relax_limits(
             self._geometry.world_from_flange(self.commanded_rad), other.world_from_flange
         )
-        self.reason = NodeNote.FOLLOWS_OTHER_ARM.phrase
+        self.reason = "waits for the other arm"
         return self._send("move", self.commanded_rad)
 
     def _align(self, alignment: Alignment, other: OtherArm) -> Command:
@@ -889,10 +889,12 @@ class ArmControl:
         self._settled = self._together = False
 
 
-def _find_late_note(goal: Goal, other: OtherArm) -> NodeNote:
+def _find_late_reason(goal: Goal, other: OtherArm) -> str:
     if goal.planner_ended:
-        return NodeNote.PLANNER_ENDED
-    return NodeNote.OTHER_BRIDGE_ENDED if other.ended else NodeNote.TARGET_OR_ARM_LATE
+        return PLANNER_ENDED
+    if other.ended:
+        return OTHER_BRIDGE_ENDED
+    return "the sheet target or the other arm is late"
 
 
 def _is_valid(motion: SheetMotion) -> bool:

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexsheet.messages.notes import NodeNote
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import BRAKE_FRACTION, closing_speed
 from flexsheet.nodes.models.rigid import angle_between
@@ -313,7 +312,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
     skew_rad = angle_between(across if left else -across, edge[:3, 0])
     if not skew_rad <= limits.max_twist_rad:
         return (
-            f"{NodeNote.SKEWED_EDGE.phrase} {np.degrees(skew_rad):.1f} degrees relative to the "
+            f"the edge is skewed by {np.degrees(skew_rad):.1f} degrees relative to the "
             f"line between both edges, maximum {np.degrees(limits.max_twist_rad):.1f}"
         )
     return None

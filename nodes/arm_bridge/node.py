@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     Arming,
@@ -141,7 +140,7 @@ class ArmBridge(Node):
     async def cycle(self) -> None:
         """Send periodic commands to the arm while no targets arrive."""
         if self._geometry is None:
-            self.note = NodeNote.WAITING_FOR_SCENE.phrase
+            self.note = "waits for the scene"
             return
         now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
         if self._control.is_idle:
@@ -162,9 +161,7 @@ class ArmBridge(Node):
         doing = f"{control.mode} {control.reason}".rstrip()
         self.note = doing
         if self._failures:
-            self.note += (
-                f"; {self._failures} {NodeNote.FAILED_EXCHANGES.phrase} (two in a row stop the arm)"
-            )
+            self.note += f"; {self._failures} failed exchanges (two in a row stop the arm)"
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
             state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)

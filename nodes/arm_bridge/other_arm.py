@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmMode, ArmState
 from flexsheet.nodes.arm_bridge.goal import MAX_PREDICTION_S, MAX_TRAJECTORY_S
 from flexsheet.nodes.arrays import Floats
@@ -108,5 +107,5 @@ class OtherArm:
         if self.mode in ("disconnected", "fault", "estop"):
             return f"other arm: {self.mode}"
         if self.mode == "starting":
-            return NodeNote.WAITING_FOR_OTHER_ARM.phrase
+            return "waiting for the other arm"
         return None

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flexsheet.messages.notes import NodeNote
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.limiter import SheetLimits
 from flexsheet.nodes.arm_bridge.reach import (
@@ -156,9 +155,7 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
     """
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
-        return (
-            f"{NodeNote.NO_PATH.phrase} the sheet's pose is not rigid at the start or at the target"
-        )
+        return "no path: the sheet's pose is not rigid at the start or at the target"
     own_rad, other_rad = request.own_rad, request.other_rad
     left_rad, right_rad = (own_rad, other_rad) if arm.left else (other_rad, own_rad)
     begin = PathStep(request.start, left_rad, right_rad)
@@ -185,7 +182,7 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
         to_rad = there.left_rad if arm.left else there.right_rad
         return Alignment(sheet, own_rad, to_rad, _find_duration_s(left, right, begin, there))
     assert first is not None
-    return f"{NodeNote.NO_PATH.phrase} {first}"
+    return f"no path: {first}"
 
 
 def _check_alignment(

@@ -8,7 +8,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Positive, Scene, StereoCamera
 from flexsheet.messages.types import ParameterChange, StereoPair
 from flexsheet.nodes import NodeRole
@@ -122,7 +121,7 @@ class Camera(Node):
         self.reader.start()
 
     def _report_end(self, pairs: int) -> None:
-        self.note = f"{pairs} {NodeNote.SOURCE_ENDED.phrase}"
+        self.note = f"{pairs} pairs read, and the source has ended"
 
     def _report_failure(self, error: DeviceError) -> None:
         self.report_error("source", error)

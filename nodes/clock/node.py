@@ -7,7 +7,6 @@ from typing import ClassVar
 from pydantic import Field
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Positive
 from flexsheet.messages.types import ClockEcho, ClockOffset, ClockPing, Clocks
 from flexsheet.nodes import NodeRole
@@ -87,7 +86,7 @@ class ClockNode(Node):
             )
         )
         self.note = ", ".join(
-            f"{NodeNote.CLOCK_OFFSETS.phrase} {one.clock_id}: {one.offset_ns * 1e-9:+.6f} s, "
+            f"clock offset of {one.clock_id}: {one.offset_ns * 1e-9:+.6f} s, "
             f"uncertainty {one.uncertainty_s * 1e3:.3f} ms"
             for one in offsets
             if one is not None

@@ -19,7 +19,6 @@ import numpy as np
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import resolve_method
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
@@ -389,7 +388,7 @@ class ConsoleController:
         """Reset the e-stop. Raises ReleaseError if the nodes ignore resets from this host."""
         if others := self.facts.others_may_reset:
             raise ReleaseError(
-                f"the host of this console {NodeNote.MAY_NOT_RESET.phrase}; "
+                "the host of this console may not reset an e-stop; "
                 f"use {' or '.join(others)}, or set may_reset_estop of this host in the launch file"
             )
         self.stopped = None

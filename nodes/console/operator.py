@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from flexsheet.messages.bag import BagError
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.busy import describe_busy
-from flexsheet.messages.notes import describe_notes
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     ArmState,
@@ -258,7 +257,7 @@ class Operator:
         recorders = [
             self._statuses[name] for name in controller.facts.recorders if name in self._statuses
         ]
-        note = describe_notes(recorders[0][0].notes) if recorders else None
+        note = recorders[0][0].note_text if recorders else None
         self._page.record.show_state(
             panels.recorder(note, self._bookmarks), recording=controller.recording
         )
@@ -273,8 +272,8 @@ class Operator:
         if skin is not None and skin[1].source_ns >= self._sent_ns:
             return ""
         solvers = self.controller.facts.solvers
-        statuses = [self._statuses[name][0] for name in solvers if name in self._statuses]
-        return describe_notes(statuses[0].notes) if statuses else ""
+        notes = (self._statuses[name][0].note_text for name in solvers if name in self._statuses)
+        return next(notes, "")
 
     def _show_eye_status(self, now_s: float) -> None:
         eye_view = self.controller.eye_view

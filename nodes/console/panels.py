@@ -10,11 +10,7 @@ from dataclasses import dataclass
 from html import escape
 from math import isnan
 
-from flexsheet.messages.notes import (
-    SELF_CHECK_REMEDIES,
-    describe_notes,
-    describe_self_check,
-)
+from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Fingertip, PortStatus, Status
 from flexsheet.nodes.console.controller import EyeViewState
@@ -125,7 +121,7 @@ def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
             state = _mark(GOOD, "running")
         else:
             state = _mark(WARN, status.state)
-        text = escape(describe_notes(status.notes))
+        text = escape(status.note_text)
         if status.errors:
             count = f"{status.errors} error{'s' if status.errors > 1 else ''}"
             text += f"<br>{_mark(BAD, f'{count}: {status.last_error}')}"

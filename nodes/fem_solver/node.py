@@ -9,7 +9,6 @@ from threading import Event
 from typing import Any, ClassVar, TypeVar
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, ParameterChange, Skin, SoftBody
 from flexsheet.nodes import OmissionReason, cache
@@ -31,7 +30,7 @@ from flexsheet.nodes.node import Input, Node, Output
 T = TypeVar("T")
 
 POLL_S = 0.05
-TABLE_NOTE = f"; {NodeNote.COMPUTING_TABLE.phrase}"
+TABLE_NOTE = "; the nonlinear table is being computed"
 BLEND_S = 5.0
 """The duration of the gradual transition between the responses of two methods, in seconds."""
 
@@ -71,7 +70,7 @@ class FemSolver(Node):
         self._fallback: DeadlineFallback
         self._set_bodies([])
         self._reset_contact()
-        self.note = NodeNote.WAITING_FOR_SCENE.phrase
+        self.note = "waits for the scene"
 
     def _reset_contact(self) -> None:
         self._last: Response | None = None
@@ -101,7 +100,7 @@ class FemSolver(Node):
             for depth_m in body.NOTED_DEPTHS_M
         )
         return (
-            f"{current.method.name}, {NodeNote.FORCE_ERROR.phrase} {errors} depth relative to the "
+            f"{current.method.name}, force error up to {errors} depth relative to the "
             "reference, "
             f"{nodes} skin nodes"
         )
@@ -121,7 +120,7 @@ class FemSolver(Node):
         self._reset_contact()
         await self._stop_table_task()
         if scene.object.material is None:
-            self.note = NodeNote.RIGID_OBJECT.phrase
+            self.note = "no soft body: the object is rigid"
             return
         p, factory = self.parameters, self._factory
         method, factory.skin_spacing_m = choose_method(
@@ -134,10 +133,10 @@ class FemSolver(Node):
                 partial(self.is_superseded, "scene"),
             )
         except precompute.Interrupted:
-            self.note = NodeNote.COMPUTATION_INTERRUPTED.phrase
+            self.note = "precomputation interrupted"
             return
         except Exception as error:
-            self.note = f"{NodeNote.SOFT_BODY_FAILED.phrase} {error}"
+            self.note = f"no soft body: {error}"
             raise
         self._set_bodies(bodies)
         self.note += factory.pending_note(scene, method, bodies)
@@ -176,7 +175,7 @@ class FemSolver(Node):
                 on_quick,
             )
         except precompute.Interrupted:
-            self.note = f"{NodeNote.TABLE_INTERRUPTED.phrase}; the next start continues it"
+            self.note = "the nonlinear table was interrupted; the next start continues it"
         except Exception as error:
             self.report_error("nonlinear_table", error)
         else:
@@ -188,7 +187,7 @@ class FemSolver(Node):
         eta = self._eta.text(done, total, self.clock.now_ns() * 1e-9)
         now = [self._describe(one) for one in self._bodies.values()]
         until_then = f"; the graph works until then with {now[0]}" if now else ""
-        self.note = f"{NodeNote.COMPUTING_SOFT_BODY.phrase} {eta} ({need}){until_then}"
+        self.note = f"precomputing the soft body: {eta} ({need}){until_then}"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:

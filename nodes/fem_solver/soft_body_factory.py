@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Literal
 
 from flexsheet.messages.methods import SoftBodyMethod, resolve_method
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import advise_precompute, load_cached
 from flexsheet.nodes.fem_solver import body, precompute, precompute_table
@@ -134,7 +133,7 @@ class SoftBodyFactory:
         if not waits_for_table or self.friction_ratio > 0.0 or len(made) > 1:
             return ""
         advice = advise_precompute(scene, f" --skin-spacing {self.skin_spacing_m:g}")
-        return f"; {NodeNote.TABLE_NOT_COMPUTED.phrase}; {advice}"
+        return f"; the scene's nonlinear table is not computed yet; {advice}"
 
     def build_table(
         self,

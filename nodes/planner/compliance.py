@@ -26,7 +26,6 @@ import numpy as np
 import scipy
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBounds
@@ -556,7 +555,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
         )
         kind, than = ("stiffer", "too soft") if error[at] < 0.0 else ("softer", "too stiff")
         return (
-            f"object is {kind} {NodeNote.FORCE_NOT_RENDERED.phrase} "
+            f"object is {kind} than the sheet can render: "
             f"{100 * abs(error[at]):.0f} % {than} at "
             f"{1e3 * rendered.depths_m[at]:.0f} mm ({rendered.force_n[at]:.2f} of "
             f"{rendered.object_force_n[at]:.2f} N), maximum {100 * np.abs(error).max():.0f} %; "
@@ -565,7 +564,7 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
     uncertainty = compute_force_uncertainty_ratio(rendered, position_error_m)
     if uncertainty > WEBER_RATIO:
         return (
-            f"object {NodeNote.TOO_SOFT_FOR_POSITION.phrase} {1e3 * position_error_m:g} mm of the "
+            f"object is too soft for the position tolerance: {1e3 * position_error_m:g} mm of the "
             f"sheet's position changes the force at {1e3 * rendered.depths_m[-1]:.0f} mm by "
             f"{100 * uncertainty:.0f} %; users notice {100 * WEBER_RATIO:.0f} to "
             f"{100 * WEBER_RATIO_BARE:.0f} %"
@@ -600,10 +599,10 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, s
     force = edge_force_n(stretch, sheet)
     rendered = push_stiffness_n_per_m(force, width_m=sheet.width_m)
     if desired < least:
-        problem = NodeNote.SOFTER_THAN_SHEET
+        problem = "softer"
     elif desired > largest:
-        problem = NodeNote.STIFFER_THAN_SHEET
+        problem = "stiffer"
     else:
         return stretch, ""
-    note = f"object of {stiffness_n_per_m:.0f} N/m {problem.phrase}, {rendered:.0f} N/m"
+    note = f"object of {stiffness_n_per_m:.0f} N/m is {problem} than the sheet, {rendered:.0f} N/m"
     return stretch, note

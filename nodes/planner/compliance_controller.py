@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from flexsheet.messages.methods import ComplianceMode
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.arrays import Floats
@@ -144,7 +143,7 @@ class ComplianceController:
             self.bandwidth_rad_per_s, suffices = fitted.choose_bandwidth_rad_per_s()
             if not suffices:
                 hand_note = (
-                    f"{NodeNote.HAND_CAN_OSCILLATE.phrase} with this object, because the sheet "
+                    "a hand of low damping can oscillate with this object, because the sheet "
                     f"follows after {1e3 * self.delay_s:.0f} ms; reduce the delay or use a stiffer "
                     "object"
                 )
@@ -158,7 +157,7 @@ class ComplianceController:
         if not reason:
             return ""
         model = f"the sheet force model {self._model.name}"
-        return f"{model} {NodeNote.FORCE_MODEL_INVALID.phrase} {reason}"
+        return f"{model} is not valid here: {reason}"
 
     def normal_offset(self, depth_m: float, position_m: SheetPosition) -> tuple[float, float]:
         """Return the sheet's normal offset (m), and its derivative with respect to the depth.

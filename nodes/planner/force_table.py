@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.methods import SheetForceMethod, resolve_method
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.nodes.cache import Specification, advise_precompute, cached, load_cached
@@ -128,6 +127,6 @@ def load_force_model(
     entry = make_table_cache(scene)
     table = load_cached(entry, cache_dir) or load_cached(entry, FOLDER)
     if table is None:
-        note = f"scaled; {NodeNote.FORCE_TABLE_MISSING.phrase}; {advise_precompute(scene)}"
+        note = f"scaled; the table of the sheet's force is missing; {advise_precompute(scene)}"
         return ScaledSheetModel(rubber), note
     return table, method

@@ -8,7 +8,6 @@ import numpy as np
 import scipy
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.messages.types import (
@@ -128,12 +127,12 @@ class Planner(Node):
     def _update_note(self) -> None:
         late = ""
         if self._late_count:
-            late = f"{NodeNote.LATE_FINGERTIPS.phrase} {self._late_count}"
+            late = f"late fingertips dropped: {self._late_count}"
         compliance = self._compliance.note if self._compliance is not None else ""
         stopped = ""
         if self._stopped_oscillations:
-            stopped = f"{NodeNote.OSCILLATIONS_STOPPED.phrase} {self._stopped_oscillations}"
-        model = f"{NodeNote.FORCE_MODEL.phrase} {self._model_text}"
+            stopped = f"oscillations of finger and sheet stopped: {self._stopped_oscillations}"
+        model = f"sheet force model: {self._model_text}"
         self.note = "; ".join(filter(None, (compliance, late, stopped, model)))
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:

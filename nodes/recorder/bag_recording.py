@@ -17,7 +17,6 @@ from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.files import free_bytes
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
@@ -55,7 +54,7 @@ class BagRecording:
         self._retry_ns = self._bag_started_ns = 0
         self.requested = False
         self.lost = 0
-        self.note = NodeNote.RECORDER_WAITS.phrase
+        self.note = "waits for a request to record"
 
     @property
     def path(self) -> Path | None:
@@ -90,7 +89,7 @@ class BagRecording:
                 self.requested, bag, self._bag = False, self._bag, None
                 if bag is not None:
                     bag.close()
-                    self.note = f"{NodeNote.RECORDED.phrase} {bag.messages} messages in {bag.path}"
+                    self.note = f"recorded: {bag.messages} messages in {bag.path}"
         except (BagError, OSError) as error:
             self._end_bag(error)
 
@@ -174,12 +173,12 @@ class BagRecording:
         self._note_progress(bag)
 
     def _note_progress(self, bag: BagWriter) -> None:
-        self.note = f"{NodeNote.RECORDING.phrase} {bag.messages} messages in {bag.path}"
+        self.note = f"recording: {bag.messages} messages in {bag.path}"
 
     def _end_bag(self, error: Exception) -> None:
         bag, self._bag = self._bag, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
-        self.note = f"{NodeNote.NOT_RECORDING.phrase} {error}"
+        self.note = f"NOT RECORDING: {error}"
         self._on_error(error)
         if bag is not None:
             # The disk error is already reported, and a truncated bag can still be read.

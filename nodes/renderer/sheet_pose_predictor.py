@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.interpolation import interpolate_path
@@ -67,7 +66,7 @@ class SheetPosePredictor:
         if sheet is None:
             fresh = age_s <= self._max_age.seconds
             why = "implausible flange poses" if fresh else f"the arm poses are {age_s:.2f} s old"
-        self.note = f"{why}: {NodeNote.LAST_SHEET_PLANE.phrase}"
+        self.note = f"{why}: keeping the last valid sheet plane"
         if self._sheet is None:
             self._sheet = scene_renderer.sheet_at_rest()
         return self._sheet

@@ -20,7 +20,6 @@ from flexsheet.messages.marker_calibration import (
     refuse_other_marker,
 )
 from flexsheet.messages.methods import resolve_method
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Scene, shows_check_marks
 from flexsheet.messages.types import (
     Fingertip,
@@ -263,6 +262,4 @@ class Triangulator(Node):
 
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
-        self.note = (
-            f"{counts}; {NodeNote.IMAGE_RESULTS.phrase} {self.late}; methods: {self.methods}"
-        )
+        self.note = f"{counts}; image pairs dropped as late: {self.late}; methods: {self.methods}"

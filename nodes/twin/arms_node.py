@@ -15,7 +15,6 @@ from pydantic import AfterValidator, Field
 
 from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes import NodeRole
@@ -217,7 +216,7 @@ class TwinArmsNode(Node):
     @periodic("rate_hz")
     async def cycle(self) -> None:
         if len(self.servers) < 2:
-            self.note = NodeNote.WAITING_FOR_SCENE.phrase
+            self.note = "waits for the scene"
             return
         for side in self.servers:
             self._advance(side)
@@ -243,6 +242,6 @@ class TwinArmsNode(Node):
             )
         )
         self.note = ", ".join(
-            f"{side}: {one.commands} {NodeNote.ARM_COMMANDS.phrase} {one.refused}"
+            f"{side}: {one.commands} commands, refused: {one.refused}"
             for side, one in ((side, server.controller) for side, server in self.servers.items())
         )

@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import Positive, Projector, Scene
 from flexsheet.messages.types import (
     Display,
@@ -126,7 +125,7 @@ class TwinEyeNode(Node):
         if not frame.pixels or not frame.label or self._queue.is_known(key, self.clock.now_ns()):
             return
         if self.scene.message is None or self.twin__arms.message is None:
-            self.note = f"{NodeNote.WAITING_FOR_SCENE.phrase} and the simulated arms"
+            self.note = "waits for the scene and the simulated arms"
         elif frame.stereo != "mono" and frame.eye == "both":
             self.note = f'frame "{frame.label}" with two views ({frame.stereo}) cannot be rendered'
         elif self._queue.is_full:
@@ -230,5 +229,5 @@ class TwinEyeNode(Node):
             seen=seen,
             expected=expected,
         )
-        self.note = f'{NodeNote.FRAME_RENDERED.phrase} "{frame.label}"'
+        self.note = f'rendered the frame "{frame.label}"'
         self.twin__eye.publish(picture, source_ns=header.source_ns)

@@ -19,7 +19,6 @@ from pydantic import Field
 
 from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.base import Header
-from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
 from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
@@ -186,7 +185,7 @@ class TwinFingerNode(Node):
         try:
             self._follow(path)
         except FingerPathError as error:
-            self.refusal = f'{NodeNote.FINGER_PATH_REFUSED.phrase} "{path.label}": {error}'
+            self.refusal = f'refused finger path "{path.label}": {error}'
             self.log.warning("finger path", problem=self.refusal)
         self._update_note()
 
@@ -361,14 +360,11 @@ class TwinFingerNode(Node):
     def _update_note(self) -> None:
         parts = []
         if self.path_label:
-            parts.append(f'{NodeNote.FOLLOWS_PATH.phrase} "{self.path_label}"')
+            parts.append(f'follows the path "{self.path_label}"')
         if self.missed_frames:
-            parts.append(
-                f"{self.missed_frames} {NodeNote.FRAMES_MISSED.phrase} because the computer was "
-                "busy"
-            )
+            parts.append(f"{self.missed_frames} frames missed because the computer was busy")
         if self.parameters.hand == "coupled" and self.coupled is None:
-            parts.append(NodeNote.COMPUTING_SHEET_REACTION.phrase)
+            parts.append("the force of the sheet on the finger is being computed")
         if self.refusal:
             parts.append(self.refusal)
         self.note = ", ".join(parts)

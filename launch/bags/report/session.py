@@ -29,7 +29,6 @@ from flexsheet.messages.bag import BagError, BagInfo, BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.busy import is_busy
 from flexsheet.messages.clock_table import ClockTable
-from flexsheet.messages.notes import describe_notes
 from flexsheet.messages.scene import RV_1A, Scene
 from flexsheet.messages.topics import TOPICS, Delivery
 from flexsheet.messages.types import (
@@ -199,7 +198,7 @@ class NodeSummary:
         news = bool(status.last_error) and status.last_error != self.last_error
         self.errors = max(self.errors, status.errors)
         self.last_error = status.last_error or self.last_error
-        self.note = describe_notes(status.notes)
+        self.note = status.note_text
         return news
 
 
