@@ -759,6 +759,9 @@ PathJoin = Literal["rounded_lines", "spline"]
 MAX_PATH_COORDINATE_M = 2.0
 """The maximum coordinate of a finger path (m). A larger one is probably in mm."""
 
+MAX_PATH_NOISE_M = 0.02
+"""The maximum wander and tremor of a finger path (m). Those of a hand are below 1 mm."""
+
 
 class FingerPath(Message):
     """A path of the simulated finger. The finger first moves smoothly to the first point."""
@@ -782,9 +785,10 @@ class FingerPath(Message):
     )
 
     def find_problem(self) -> str:
-        """Return why the times or points are not valid, or "".
+        """Return why the path is not valid, or "".
 
-        One increasing time per point is required, and each point must be near the screen.
+        One increasing time per point is required, each point must be near the screen, and wander
+        and tremor must be those of a hand.
         """
         times_s, points = self.times_s, len(self.positions_world_m)
         if len(times_s) != points or points == 0:
@@ -807,6 +811,12 @@ class FingerPath(Message):
                 f"{MAX_PATH_COORDINATE_M:g} m from the centre of the screen; give positions in "
                 "metres (20 mm are 0.02)"
             )
+        for name in ("wander_m", "tremor_m"):
+            if (noise_m := getattr(self, name)) > MAX_PATH_NOISE_M:
+                return (
+                    f"{name}: {noise_m:g} m is more than {MAX_PATH_NOISE_M:g} m; give metres "
+                    "(0.5 mm are 0.0005)"
+                )
         return ""
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -66,15 +65,22 @@ def test_a_path_is_recorded_only_after_its_end(tmp_path: Path) -> None:
     assert not run.is_path_recorded(bag, "another")
 
 
-async def test_an_evaluation_waits_for_the_recorder(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_evaluation_waits_while_the_recorder_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(run, "FLUSH_PERIOD_S", 0.0)
-    results: Iterator[str | None] = iter([None, None, "result"])
-    reported: list[str] = []
-    await run.make_evaluation(lambda: next(results), reported.append, "a path")(DRIVER, SCENE)
-    assert reported == ["result"]
     monkeypatch.setattr(run, "RECORD_WAIT_S", -1.0)
-    with pytest.raises(ExperimentError, match="has not written a path within"):
-        await run.make_evaluation(lambda: None, reported.append, "a path")(DRIVER, SCENE)
+    bag, reported = tmp_path / "a.mcap", list[str]()
+    bag.touch()
+
+    def evaluate_growing_bag() -> str | None:
+        bag.write_text(bag.read_text() + "more")
+        return "result" if len(bag.read_text()) >= 12 else None
+
+    await run.make_evaluation(bag, evaluate_growing_bag, reported.append, "a path")(DRIVER, SCENE)
+    assert reported == ["result"]
+    with pytest.raises(ExperimentError, match=r"has written nothing for .* a path is not in"):
+        await run.make_evaluation(bag, lambda: None, reported.append, "a path")(DRIVER, SCENE)
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])

@@ -29,7 +29,7 @@ from flexsheet.nodes.twin.clutter import (
     together,
     touching_highlight,
 )
-from flexsheet.nodes.twin.pixels import Sensor, TwinCamera, Window, disjoint
+from flexsheet.nodes.twin.pixels import MAX_MOTION_STEPS, Sensor, TwinCamera, Window, disjoint
 from flexsheet.nodes.twin.rig import make_true_camera, pixels_of, slopes_of
 from tests.examples import examples
 from tests.scenes import load_cylinder
@@ -330,6 +330,19 @@ def test_out_of_focus_the_marker_spreads_as_in_optics_and_keeps_its_light(
 def test_a_defocus_beyond_infinity_is_rejected() -> None:
     with pytest.raises(ValueError, match="aperture_m above"):
         Sensor(aperture_m=0.001).out_of_focus(3.0, 0.5, 540.0)
+
+
+def test_a_finger_of_any_speed_is_drawn_at_a_bounded_number_of_positions(
+    rig: StereoCamera,
+) -> None:
+    drawn_at: list[float] = []
+
+    def position(at_s: float) -> NDArray[np.float64]:
+        drawn_at.append(at_s)
+        return TIP + at_s * np.array([1e9, 0.0, 0.0])
+
+    looking(rig).picture(position, exposure_s=0.004)
+    assert len(drawn_at) <= MAX_MOTION_STEPS + 2
 
 
 def test_over_exposure_brightens_all_and_fills_the_marker(rig: StereoCamera) -> None:

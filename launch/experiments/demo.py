@@ -120,7 +120,7 @@ def make_demo_procedures(
     made: list[Procedure] = []
 
     def add(procedure: Procedure, evaluate: Callable[[], DemoResult | None], name: str) -> None:
-        made.extend((procedure, make_evaluation(evaluate, report, name)))
+        made.extend((procedure, make_evaluation(bag, evaluate, report, name)))
 
     if path is None:
         for number, seconds in enumerate(SECONDS, 1):

@@ -8,7 +8,6 @@ nodes report, and an overload of the computer.
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -79,17 +78,12 @@ WAIT_S = 20.0
 FRAME_WAIT_S = 20.0
 """The maximum time to wait for the next frame, or for the eye's image after the last frame."""
 
-MAX_IMAGE_FRAMES = 600
-MAX_IMAGE_WAIT_S = 300.0
-"""The maximum time to wait for an image of the simulated eye.
+MAX_WAIT_S = 3600.0
+"""The maximum time to wait for a table of the soft body or an image of the simulated eye, although
+there is progress.
 
-An idle computer needs a few seconds.
-"""
-MAX_TABLE_WAIT_S = 3600.0
-"""The maximum time to wait for a table of the soft body.
-
-Two idle cores need about a minute for the coarse table, and about eight minutes for the complete
-table.
+Two idle cores need about a minute for the coarse table, about eight minutes for the complete table,
+and a few seconds for an image.
 """
 PROGRESS_PERIOD_S = 5.0
 
@@ -98,27 +92,27 @@ PROGRESS_PERIOD_S = 5.0
 class Waiter:
     """A pending wait for a condition, with a deadline.
 
-    Each frame that the renderer publishes postpones the deadline, up to a limit.
-
-    seconds: time (s) to wait after the start, and after each frame that postpones the deadline.
+    progress: type of the messages that postpone the deadline.
+    seconds: time (s) to wait after the start, and after each message that postpones the deadline.
     latest_s: latest deadline, in the time of the event loop.
-    frames: number of frames that can still postpone the deadline.
     """
 
     condition: Callable[[], bool]
     future: asyncio.Future[None]
     deadline: asyncio.Timeout
+    progress: type[Message] | None
     seconds: float
     latest_s: float
-    frames: int
 
-    def add_frame(self) -> None:
-        """Postpone the deadline of the wait, because the renderer has published a frame."""
-        if self.frames == 0 or self.deadline.expired() or self.future.done():
+    def add_message(self, message: Message) -> None:
+        """End the wait if its condition is met, or postpone its deadline."""
+        if self.deadline.expired() or self.future.done():
             return
-        self.frames -= 1
-        until_s = asyncio.get_running_loop().time() + self.seconds
-        self.deadline.reschedule(min(until_s, self.latest_s))
+        if self.condition():
+            self.future.set_result(None)
+        elif self.progress is not None and isinstance(message, self.progress):
+            until_s = asyncio.get_running_loop().time() + self.seconds
+            self.deadline.reschedule(min(until_s, self.latest_s))
 
 
 class Driver:
@@ -197,10 +191,7 @@ class Driver:
             if isinstance(message, HostStatus):
                 self._hosts[message.host] = message
             for waiter in self._waiters:
-                if isinstance(message, Frame):
-                    waiter.add_frame()
-                if not waiter.future.done() and waiter.condition():
-                    waiter.future.set_result(None)
+                waiter.add_message(message)
 
         return handle
 
@@ -222,16 +213,14 @@ class Driver:
         description: str,
         seconds: float,
         *,
-        max_frames: int = 0,
-        max_seconds: float = math.inf,
+        progress: type[Message] | None = None,
         error: type[ExperimentError] = ExperimentError,
     ) -> None:
         """Wait until `condition` returns True; it is evaluated when a message arrives.
 
         description: name of the condition in the error text.
         seconds: time to wait.
-        max_frames: maximum number of renderer frames that restart this time.
-        max_seconds: limit of the total time.
+        progress: type of the messages that restart this time, up to a total of MAX_WAIT_S.
         error: class of the error that is raised if the condition is not met in time.
 
         Raises OverloadedError instead if a computer is overloaded.
@@ -244,7 +233,7 @@ class Driver:
         try:
             async with asyncio.timeout(seconds) as deadline:
                 waiter = Waiter(
-                    condition, future, deadline, seconds, begun_s + max_seconds, max_frames
+                    condition, future, deadline, progress, seconds, begun_s + MAX_WAIT_S
                 )
                 self._waiters.append(waiter)
                 try:
@@ -253,8 +242,6 @@ class Driver:
                     self._waiters.remove(waiter)
         except TimeoutError:
             what = f"timeout: waited {loop.time() - begun_s:.3g} s for {description}"
-            if max_frames:
-                what += f", during {max_frames - waiter.frames} frames"
             raise self.make_timeout_error(what, error) from None
 
     def make_timeout_error(
@@ -314,7 +301,7 @@ class Driver:
 
         progress: function that receives the node's progress and remaining time.
 
-        Raises ExperimentError if the wait takes longer than `MAX_TABLE_WAIT_S`, or if the table
+        Raises ExperimentError if the wait takes longer than `MAX_WAIT_S`, or if the table
         cannot be computed.
         """
         solvers = {name: p for name, p in self._solvers() if _computes_table(p, scene)}
@@ -344,7 +331,7 @@ class Driver:
                 lambda: is_precise() or bool(failures),
                 f"the soft body by the {method.replace('_', ' ')}; compute the table before the "
                 "experiment (flexsheet precompute SCENE), or choose the linear method in the scene",
-                MAX_TABLE_WAIT_S,
+                MAX_WAIT_S,
             )
         finally:
             self.on_message = previous
@@ -444,8 +431,7 @@ class Driver:
             received,
             f'the eye\'s image of "{label}"',
             FRAME_WAIT_S,
-            max_frames=MAX_IMAGE_FRAMES,
-            max_seconds=MAX_IMAGE_WAIT_S,
+            progress=Frame,
         )
         # Stop sending pixels in frames until the next image.
         self.show(Display(correction=correction, stereo="side_by_side"))

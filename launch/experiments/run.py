@@ -7,6 +7,7 @@ coroutine that controls the running graph by a `Driver`.
 from __future__ import annotations
 
 import asyncio
+import os
 import shlex
 import signal
 import time
@@ -34,7 +35,7 @@ DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")
 DELIVERY_S = 0.3
 RECORD_WAIT_S = 60.0
-"""The maximum time to wait until the recorder has written an experiment to the bag."""
+"""The maximum time to wait for an experiment in the bag while the recorder writes nothing."""
 
 SWITCH_SEED, SWITCH_INTERVAL_S = 1, (0.25, 0.4)
 """The random seed and the range (s) of the times between two switches of the projected image.
@@ -273,10 +274,11 @@ def chain_procedures(*procedures: Procedure) -> Procedure:
 
 
 def make_evaluation(
-    evaluate: Callable[[], Result | None], report: Callable[[Result], None], name: str
+    bag: Path, evaluate: Callable[[], Result | None], report: Callable[[Result], None], name: str
 ) -> Procedure:
     """Make a procedure (coroutine) that evaluates a finished experiment while the graph still runs.
 
+    bag: file that the recorder writes.
     evaluate: function that reads the bag and returns the result; None if the recorder has not yet
         written the experiment.
     report: function that receives the result.
@@ -284,11 +286,18 @@ def make_evaluation(
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
-        deadline_s = time.monotonic() + RECORD_WAIT_S
-        while (result := await asyncio.to_thread(evaluate)) is None:
-            if time.monotonic() > deadline_s:
+        evaluated_bytes, waited_from_s = -1, time.monotonic()
+        while True:
+            # An evaluation of a large bag can take longer than the recorder needs to write the end.
+            written_bytes = os.stat(bag).st_size
+            if (result := await asyncio.to_thread(evaluate)) is not None:
+                break
+            if written_bytes > evaluated_bytes:
+                evaluated_bytes, waited_from_s = written_bytes, time.monotonic()
+            elif time.monotonic() > waited_from_s + RECORD_WAIT_S:
                 raise driver.make_timeout_error(
-                    f"timeout: the recorder has not written {name} within {RECORD_WAIT_S:g} s"
+                    f"timeout: the recorder has written nothing for {RECORD_WAIT_S:g} s, and "
+                    f"{name} is not in {bag}"
                 )
             await asyncio.sleep(FLUSH_PERIOD_S)
         report(result)
