@@ -211,7 +211,7 @@ class TestRecorder:
     [
         ("side", "middle", 'expected left or right, found "middle"'),
         ("x_mm", "nan", 'x_mm: expected a finite number, found "nan"'),
-        ("left_j3_deg", "", 'left_j3_deg: expected a finite number, found ""'),
+        ("left_j3_deg", "", 'left_j3_deg: expected a number, found ""; write a number'),
     ],
 )
 def test_wrong_rows_are_named(tmp_path: Path, column: str, value: str, message: str) -> None:

@@ -96,7 +96,7 @@ def test_alignments_are_read_from_a_file(tmp_path: Path) -> None:
     ("row", "words"),
     [
         ("middle,0,0,100,0,0,0", "eye: expected left or right"),
-        ("left,0,x,100,0,0,0", "bead_y_mm: expected a finite number"),
+        ("left,0,x,100,0,0,0", "bead_y_mm: expected a number"),
     ],
 )
 def test_bad_rows_are_refused(tmp_path: Path, row: str, words: str) -> None:

@@ -328,7 +328,7 @@ def test_a_table_of_board_poses_will_do(tmp_path: Path, unit: str) -> None:
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("", "the table has no rows"),
+        ("", "is empty; start with"),
         ("left,right\na,b\n", r"has no joint angles \(columns: left, right\); add the columns j1"),
         ("left,right,j1_deg\na,b,0\n", "add the columns j1_deg to j6_deg"),
         (
@@ -338,13 +338,16 @@ def test_a_table_of_board_poses_will_do(tmp_path: Path, unit: str) -> None:
         ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "the table has no rows"),
         (
             "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,x,0,0,0\n",
-            'joints.csv:2: j3_deg: expected a finite number, found "x"',
+            'joints.csv:2: j3_deg: expected a number, found "x"; write a number',
         ),
         (
             "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,0,0,0,nan\n",
             "joints.csv:2: j6_deg",
         ),
-        ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0\n", "csv:2: j3_deg"),
+        (
+            "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0\n",
+            "csv:2: expected 8 values, found 4",
+        ),
         ("\x00\xff", "the table has no rows"),
     ],
 )

@@ -27,9 +27,8 @@ from flexsheet.launch.calibration.corners import (
     find_pairs,
     match_views,
 )
-from flexsheet.launch.calibration.csv_rows import parse_finite, read_rows
+from flexsheet.launch.calibration.csv_rows import parse_finite, read_table
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CameraLens, CornerView, LensRig
-from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.messages.errors import FlexsheetError
@@ -132,10 +131,11 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
     Raises ArmPosesError or BadInputError if the table is missing or invalid.
     """
     path = folder / TABLE
-    lines = read_rows(path, ())
-    if not lines:
+    table = read_table(path, ())
+    lines = table.rows
+    if not lines and not table.problems:
         raise ArmPosesError(f"{path}: the table has no rows; add one row per pose of the arm")
-    columns = [name for name in lines[0][1] if name]
+    columns = [name for name in table.columns if name]
     unit = next(
         (one for one in ("deg", "rad") if all(f"{j}_{one}" in columns for j in JOINTS)), None
     )
@@ -150,11 +150,15 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
             f"{path}: the table has neither images nor board poses; add the columns left and "
             f"right, or {', '.join(BOARD_COLUMNS)}"
         )
-    problems: list[Problem] = []
     rows = []
-    for number, (where, line) in enumerate(lines, start=2):
+    for number, line in lines:
         joints, pose = (
-            np.array([parse_finite(where, name, line[name], problems) for name in names])
+            np.array(
+                [
+                    parse_finite(f"{path}:{number}", name, line[name], table.problems)
+                    for name in names
+                ]
+            )
             for names in ([f"{joint}_{unit}" for joint in JOINTS], BOARD_COLUMNS if by_pose else ())
         )
         joints_rad = np.radians(joints) if unit == "deg" else joints
@@ -164,8 +168,7 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
         else:
             images = (folder / line["left"], folder / line["right"])
             rows.append(PoseRow(line["left"] or f"row {number}", joints_rad, images, None))
-    if problems:
-        raise BadInputError(problems)
+    table.check()
     return rows
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
@@ -12,102 +13,116 @@ from flexsheet.messages.types import Side
 
 SIDES: tuple[Side, Side] = ("left", "right")
 
+MAX_PROBLEMS = 20
+"""The maximum number of problems in a file that are listed. Further problems are only counted."""
 
-def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """Return (location, values by column) for each row of a CSV file.
 
-    The location has the form FILE:LINE.
+@dataclass(frozen=True, slots=True)
+class Table:
+    """The cells of a CSV file.
 
-    columns: names of all required columns.
-
-    Raises BadInputError if the file cannot be read, or if a column is missing.
+    where: location of the header, as FILE:LINE.
+    columns: names of the columns.
+    rows: line number and cells by column of each row.
+    problems: rows with a wrong number of cells, which `rows` omits. Further problems of the rows
+        are to be appended.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, restval="")
-            rows = [(f"{path}:{reader.line_num}", row) for row in reader]
-            found = tuple(reader.fieldnames or ())
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise BadInputError.single(str(path), (), f"{error}", "give a CSV file in UTF-8") from error
-    missing = list_missing(str(path), found, columns)
-    if missing:
-        raise BadInputError(missing)
-    return rows
 
+    path: Path
+    where: str
+    columns: list[str]
+    rows: list[tuple[int, dict[str, str]]]
+    problems: list[Problem]
 
-def _unreadable(path: Path, error: OSError) -> BadInputError:
-    return BadInputError.single(
-        str(path), (), f"cannot be read: {error.strerror}", "check the path"
-    )
+    def check(self) -> None:
+        """Raise BadInputError if there are problems."""
+        shown = self.problems[:MAX_PROBLEMS]
+        if len(shown) < len(self.problems):
+            more = len(self.problems) - len(shown)
+            shown.append(Problem(str(self.path), (), f"and {more} more"))
+        if shown:
+            raise BadInputError(shown)
 
 
 def read_table(
-    path: Path,
-    columns: Sequence[str],
-    check_header: Callable[[str, Sequence[str]], list[Problem]],
-    problems: list[Problem],
-) -> list[tuple[int, dict[str, str]]]:
-    """Return (line number, values by column) for each row of a CSV file.
+    path: Path, required: Sequence[str], *, permitted: Sequence[str] | None = None
+) -> Table:
+    """Read a CSV file. Empty lines and lines that start with # are skipped.
 
-    Empty lines and lines that start with # are skipped. If a row has a wrong number of values, the
-    row is omitted and a problem is appended to `problems`.
-
-    columns: names of all permitted columns.
-    check_header: function that returns further problems of the header. Its arguments are the
-        location of the header and the column names in the file.
+    required: names of all columns that must be present.
+    permitted: names of all permitted columns; None: all names are permitted.
 
     Raises BadInputError if the file cannot be read, is empty, or has wrong columns.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
+        lines = [
+            (number, [cell.strip() for cell in next(csv.reader([line]))])
+            for number, line in enumerate(text.splitlines(), start=1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
     except OSError as error:
-        raise _unreadable(path, error) from error
+        raise BadInputError.single(
+            str(path), (), f"cannot be read: {error.strerror}", "check the path and its permissions"
+        ) from error
     except UnicodeDecodeError as error:
-        raise BadInputError.single(str(path), (), f"{error}", "give a CSV file in UTF-8") from error
-    lines = [
-        (number, [cell.strip() for cell in next(csv.reader([line]))])
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+        raise BadInputError.single(
+            str(path), (), f"is not a text file: {error}", "save it as CSV with UTF-8 text"
+        ) from error
+    except csv.Error as error:
+        raise BadInputError.single(
+            str(path), (), f"is not a CSV file: {error}", "separate the values of a row by commas"
+        ) from error
     if not lines:
-        remedy = f"start with a line of columns: {', '.join(columns)}"
+        remedy = f"start with a line of columns: {', '.join(permitted or required)}"
         raise BadInputError.single(str(path), (), "is empty", remedy)
-    (first, names), *rows = lines
+    (first, columns), *rows = lines
     where = f"{path}:{first}"
-    wrong = [
-        Problem(where, (name,), "unknown column", did_you_mean(name, columns))
-        for name in names
-        if name not in columns
+    problems = [
+        Problem(where, (name,), "unknown column", did_you_mean(name, permitted))
+        for name in columns
+        if permitted is not None and name not in permitted
     ]
-    wrong += [
+    problems += [
         Problem(where, (name,), "duplicate column", "remove one")
-        for name in dict.fromkeys(names)
-        if names.count(name) > 1
+        for name in dict.fromkeys(columns)
+        if columns.count(name) > 1
     ]
-    wrong += check_header(where, names)
-    if wrong:
-        raise BadInputError(wrong)
-    for number, cells in rows:
-        if len(cells) != len(names):
-            what = f"expected {len(names)} values, found {len(cells)}"
-            problems.append(Problem(f"{path}:{number}", (), what, "give one value per column"))
-    return [
-        (number, dict(zip(names, cells, strict=True)))
-        for number, cells in rows
-        if len(cells) == len(names)
-    ]
+    problems += list_missing(where, columns, required)
+    if problems:
+        raise BadInputError(problems)
+    return Table(
+        path=path,
+        where=where,
+        columns=columns,
+        rows=[
+            (number, dict(zip(columns, cells, strict=True)))
+            for number, cells in rows
+            if len(cells) == len(columns)
+        ],
+        problems=[
+            Problem(
+                f"{path}:{number}",
+                (),
+                f"expected {len(columns)} values, found {len(cells)}",
+                "give one value per column",
+            )
+            for number, cells in rows
+            if len(cells) != len(columns)
+        ],
+    )
 
 
-def list_missing(where: str, names: Sequence[str], wanted: Sequence[str]) -> list[Problem]:
+def list_missing(where: str, columns: Sequence[str], wanted: Sequence[str]) -> list[Problem]:
     """Return a problem for each wanted column that is missing in the header of a file.
 
     where: location of the header.
-    names: column names in the header.
+    columns: names of the columns in the header.
     """
     return [
-        Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
+        Problem(where, (name,), "missing column", "add it")
+        for name in wanted
+        if name not in columns
     ]
 
 
@@ -117,7 +132,7 @@ def parse_side(where: str, name: str, text: str, problems: list[Problem]) -> Sid
     If the text is neither "left" nor "right", append a problem to `problems` and return "left".
     """
     for side in SIDES:
-        if text.strip() == side:
+        if text == side:
             return side
     what = f'expected left or right, found "{text}"'
     problems.append(Problem(where, (name,), what, "write left or right"))
@@ -132,8 +147,11 @@ def parse_finite(where: str, name: str, text: str, problems: list[Problem]) -> f
     try:
         value = float(text)
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+        what, remedy = f'expected a number, found "{text}"', "write a number, such as 12.5"
+    else:
+        if math.isfinite(value):
+            return value
         what = f'expected a finite number, found "{text}"'
-        problems.append(Problem(where, (name,), what, "measure this row again, or remove it"))
-    return value
+        remedy = "measure this row again, or remove it"
+    problems.append(Problem(where, (name,), what, remedy))
+    return math.nan

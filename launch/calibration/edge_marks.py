@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from flexsheet.launch.calibration.arm_poses import MAX_STILL_RAD, MIN_STILL_S
-from flexsheet.launch.calibration.csv_rows import SIDES, parse_finite, parse_side, read_rows
+from flexsheet.launch.calibration.csv_rows import SIDES, parse_finite, parse_side, read_table
 from flexsheet.launch.calibration.edge_fit import EdgeMark, HeldPose
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
-from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
@@ -70,10 +69,11 @@ def read_edge_marks(path: Path) -> list[HeldPose]:
 
     Raises BadInputError if the file is invalid.
     """
-    problems: list[Problem] = []
+    table = read_table(path, COLUMNS)
     joints: dict[str, tuple[Floats, Floats]] = {}
     marks: dict[str, list[EdgeMark]] = defaultdict(list)
-    for where, row in read_rows(path, COLUMNS):
+    for number, row in table.rows:
+        where, problems = f"{path}:{number}", table.problems
         values = {name: parse_finite(where, name, row[name], problems) for name in COLUMNS[2:]}
         side = parse_side(where, "side", row["side"], problems)
         left, right = np.radians([values[name] for name in JOINT_COLUMNS]).reshape(2, 6)
@@ -81,8 +81,7 @@ def read_edge_marks(path: Path) -> list[HeldPose]:
         mark_edge_m = 1e-3 * np.array([0.0, values["along_mm"], 0.0])
         position_m = 1e-3 * np.array([values["x_mm"], values["y_mm"], values["z_mm"]])
         marks[row["pose"]].append(EdgeMark(side, mark_edge_m, position_m))
-    if problems:
-        raise BadInputError(problems[:MAX_PROBLEMS])
+    table.check()
     return [HeldPose(*joints[pose], tuple(marks[pose])) for pose in joints]
 
 

@@ -19,10 +19,9 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from flexsheet.launch.calibration.csv_rows import SIDES, parse_finite, parse_side, read_rows
+from flexsheet.launch.calibration.csv_rows import SIDES, parse_finite, parse_side, read_table
 from flexsheet.launch.calibration.edge_marks import MarkDetector, rest
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
-from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.errors import FlexsheetError
@@ -216,14 +215,14 @@ def read_alignments(path: Path) -> list[Alignment]:
 
     Raises BadInputError if the file is invalid.
     """
-    problems: list[Problem] = []
+    table = read_table(path, COLUMNS)
     found = []
-    for where, row in read_rows(path, COLUMNS):
+    for number, row in table.rows:
+        where, problems = f"{path}:{number}", table.problems
         side = parse_side(where, "eye", row["eye"], problems)
         values = [parse_finite(where, name, row[name], problems) for name in COLUMNS[1:]]
         found.append(Alignment(side, 1e-3 * np.array(values[:3]), 1e-3 * np.array(values[3:])))
-    if problems:
-        raise BadInputError(problems)
+    table.check()
     return found
 
 

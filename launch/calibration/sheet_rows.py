@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from flexsheet.launch.calibration.csv_rows import list_missing, read_table
+from flexsheet.launch.calibration.csv_rows import parse_finite, read_table
 from flexsheet.launch.calibration.sheet_fit import MeasuredPush
 from flexsheet.launch.calibration.simulated_sheet import SimulatedSheet
 from flexsheet.launch.plans.documents import BadInputError, Problem
@@ -20,12 +20,7 @@ REQUIRED = ("depth_mm", "force_n")
 STRETCH = ("edge_distance_mm", "stretch_ratio")
 OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
-
-MAX_PROBLEMS = 20
-"""The maximum number of problems in a file that are listed.
-
-Further problems are only counted.
-"""
+SIGNED = ("x_mm", "y_mm", "force_n", "edge_force_n")
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
 """The maximum plausible ratio of a length to the sheet's width, by column of the CSV file.
@@ -49,36 +44,24 @@ def read_rows(
 
     Raises BadInputError if the file is invalid.
     """
-    problems: list[Problem] = []
+    table = read_table(path, REQUIRED, permitted=COLUMNS)
+    if sum(name in table.columns for name in STRETCH) != 1:
+        what = f"expected one of the columns {' and '.join(STRETCH)}"
+        raise BadInputError.single(table.where, (), what, "use exactly one")
     pushes: list[MeasuredPush] = []
     numbers: list[int] = []
-    for number, cells in read_table(path, COLUMNS, _check_header, problems):
+    for number, cells in table.rows:
         found: list[Problem] = []
         values = _parse_row(f"{path}:{number}", cells, sheet, found)
         if found:
-            problems += found
+            table.problems.extend(found)
         else:
             pushes.append(_make_push(values, sheet, finger_radius_m))
             numbers.append(number)
-    if problems:
-        shown = problems[:MAX_PROBLEMS]
-        if len(problems) > MAX_PROBLEMS:
-            shown.append(Problem(str(path), (), f"and {len(problems) - MAX_PROBLEMS} more"))
-        raise BadInputError(shown)
+    table.check()
     if not pushes:
         raise BadInputError.single(str(path), (), "does not contain rows", "add one line per push")
     return pushes, numbers
-
-
-def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
-    problems = list_missing(where, names, REQUIRED)
-    if sum(name in names for name in STRETCH) != 1:
-        problems.append(
-            Problem(
-                where, (), f"expected one of the columns {' and '.join(STRETCH)}", "use exactly one"
-            )
-        )
-    return problems
 
 
 def _parse_row(
@@ -92,58 +75,41 @@ def _parse_row(
     for name, text in cells.items():
         if not text and name in OPTIONAL:
             continue
-        try:
-            value = float(text)
-        except ValueError:
-            problems.append(
-                Problem(
-                    where,
-                    (name,),
-                    f'expected a number, found "{text}"',
-                    "write a number, such as 12.5",
-                )
-            )
+        value = parse_finite(where, name, text, problems)
+        if math.isnan(value):
             continue
-        if name == "unloading":
-            if value in (0.0, 1.0):
-                values[name] = value
-            else:
-                problems.append(
-                    Problem(
-                        where,
-                        (name,),
-                        f"expected 0 or 1, found {text}",
-                        "write 1 for unloading, or 0 for loading",
-                    )
-                )
-            continue
-        signed = name in ("x_mm", "y_mm", "force_n", "edge_force_n")
-        if not math.isfinite(value) or (value <= 0.0 and not signed):
-            problems.append(
-                Problem(where, (name,), f"expected a positive finite number, found {text}")
-            )
-        elif 1e-3 * value > MAX_LENGTH_RATIO.get(name, math.inf) * sheet.width_m:
-            problems.append(
-                Problem(where, (name,), f"{text} mm is too large for a sheet of "
-                        f"{1e3 * sheet.width_m:g} mm", "give lengths in mm")
-            )  # fmt: skip
-        elif name == "stretch_ratio" and not 0.8 < value < 3.0:
-            problems.append(
-                Problem(
-                    where,
-                    (name,),
-                    f"expected a ratio near 1, found {text}",
-                    "write a ratio, such as 1.05",
-                )
-            )
-        else:
+        what = _find_problem(name, value, sheet)
+        if what is None:
             values[name] = value
+        else:
+            problems.append(Problem(where, (name,), *what))
     sides = (("x_mm", 0.5 * MAX_LENGTH_RATIO["edge_distance_mm"] * sheet.width_m),
              ("y_mm", 0.5 * sheet.height_m))  # fmt: skip
     for name, half in sides:
         if abs(1e-3 * values.get(name, 0.0)) >= half:
             problems.append(Problem(where, (name,), f"{values[name]:g} mm is outside the sheet"))
     return values
+
+
+def _find_problem(name: str, value: float, sheet: SheetSpec) -> tuple[str, str] | None:
+    """Return what is wrong with a value in the column `name`, and the remedy, or None."""
+    if name == "unloading":
+        correct = value in (0.0, 1.0)
+        what, remedy = "expected 0 or 1", "write 1 for unloading, or 0 for loading"
+    elif name in SIGNED:
+        return None
+    elif value <= 0.0:
+        correct, what, remedy = False, "expected a positive number", "write the magnitude"
+    elif name == "stretch_ratio":
+        correct = 0.8 < value < 3.0
+        what, remedy = "expected a ratio near 1", "write a ratio, such as 1.05"
+    else:
+        correct = 1e-3 * value <= MAX_LENGTH_RATIO[name] * sheet.width_m
+        what, remedy = (
+            f"expected mm, on a sheet of {1e3 * sheet.width_m:g} mm",
+            "give lengths in mm",
+        )
+    return None if correct else (f"{what}, found {value:g}", remedy)
 
 
 def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: float) -> MeasuredPush:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from flexsheet.launch.calibration.csv_rows import list_missing, parse_finite, read_table
 from flexsheet.launch.calibration.edge_marks import make_detector_config
 from flexsheet.launch.calibration.marker_fit import Touch
-from flexsheet.launch.plans.documents import BadInputError, Problem
+from flexsheet.launch.plans.documents import Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
@@ -33,7 +33,6 @@ REQUIRED = ("marker_x_mm", "marker_y_mm", "marker_z_mm",
 NORMAL = ("normal_x", "normal_y", "normal_z")
 COLUMNS = (*REQUIRED, *NORMAL)
 
-MAX_PROBLEMS = 20
 MAX_TILT_DEG = 120.0
 MAX_LENGTH_MM = 5000.0
 """The maximum plausible coordinate (mm). A larger number probably has another unit."""
@@ -45,22 +44,18 @@ def read_touches(path: Path, scene: Scene) -> list[Touch]:
     The document docs/set-up-marker.md lists the columns. Raises BadInputError if the file is
     invalid.
     """
-    problems: list[Problem] = []
+    table = read_table(path, REQUIRED, permitted=COLUMNS)
+    if any(name in table.columns for name in NORMAL):
+        table.problems.extend(list_missing(table.where, table.columns, NORMAL))
     touches = []
-    for number, cells in read_table(path, COLUMNS, _check_header, problems):
+    for number, cells in table.rows:
         found: list[Problem] = []
         values = _parse_row(f"{path}:{number}", cells, found)
         if not found:
             touches.append(_make_touch(values, scene))
-        problems += found
-    if problems:
-        raise BadInputError(problems[:MAX_PROBLEMS])
+        table.problems.extend(found)
+    table.check()
     return touches
-
-
-def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
-    wanted = COLUMNS if any(name in names for name in NORMAL) else REQUIRED
-    return list_missing(where, names, wanted)
 
 
 def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) -> dict[str, float]:
