@@ -105,10 +105,8 @@ def _find_problem(name: str, value: float, sheet: SheetSpec) -> tuple[str, str] 
         what, remedy = "expected a ratio near 1", "write a ratio, such as 1.05"
     else:
         correct = 1e-3 * value <= MAX_LENGTH_RATIO[name] * sheet.width_m
-        what, remedy = (
-            f"expected mm, on a sheet of {1e3 * sheet.width_m:g} mm",
-            "give lengths in mm",
-        )
+        what = f"expected mm, on a sheet of {1e3 * sheet.width_m:g} mm"
+        remedy = "give lengths in mm"
     return None if correct else (f"{what}, found {value:g}", remedy)
 
 
