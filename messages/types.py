@@ -759,8 +759,8 @@ PathJoin = Literal["rounded_lines", "spline"]
 MAX_PATH_COORDINATE_M = 2.0
 """The maximum coordinate of a finger path (m). A larger one is probably in mm."""
 
-MAX_PATH_NOISE_M = 0.02
-"""The maximum wander and tremor of a finger path (m). Those of a hand are below 1 mm."""
+HandNoise = Annotated[float, Field(ge=0.0, le=0.02)]
+"""The amplitude of a random motion of the finger (m). That of a hand is below 1 mm."""
 
 
 class FingerPath(Message):
@@ -769,10 +769,8 @@ class FingerPath(Message):
     label: str
     times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
     positions_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))]
-    wander_m: NonNegative = Field(
-        default=0.0, description="standard deviation of slow random position errors of the hand, m"
-    )
-    tremor_m: NonNegative = Field(
+    wander_m: HandNoise = Field(default=0.0, description="rms of slow random position errors, m")
+    tremor_m: HandNoise = Field(
         default=0.0, description="amplitude of the simulated hand tremor from 8 to 12 Hz, m"
     )
     joined_by: PathJoin = Field(
@@ -787,8 +785,7 @@ class FingerPath(Message):
     def find_problem(self) -> str:
         """Return why the path is not valid, or "".
 
-        One increasing time per point is required, each point must be near the screen, and wander
-        and tremor must be those of a hand.
+        One increasing time per point is required, and each point must be near the screen.
         """
         times_s, points = self.times_s, len(self.positions_world_m)
         if len(times_s) != points or points == 0:
@@ -811,12 +808,6 @@ class FingerPath(Message):
                 f"{MAX_PATH_COORDINATE_M:g} m from the centre of the screen; give positions in "
                 "metres (20 mm are 0.02)"
             )
-        for name in ("wander_m", "tremor_m"):
-            if (noise_m := getattr(self, name)) > MAX_PATH_NOISE_M:
-                return (
-                    f"{name}: {noise_m:g} m is more than {MAX_PATH_NOISE_M:g} m; give metres "
-                    "(0.5 mm are 0.0005)"
-                )
         return ""
 
 

@@ -17,8 +17,8 @@ from flexsheet.messages.types import FingerPath, PathJoin
 from flexsheet.nodes.twin.finger import (
     FingerMotion,
     FingerPathError,
+    join_points,
     minimum_jerk_profile,
-    validate_path,
 )
 from flexsheet.nodes.twin.gestures import (
     GESTURES,
@@ -106,7 +106,7 @@ def test_a_gesture_keeps_to_the_scenes_speed_and_volume(
     positions = np.array([state.position for state in states])
     assert (positions >= scene.finger.volume_min_m).all()
     assert (positions <= scene.finger.volume_max_m).all()
-    steady = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    steady = join_points(path.times_s, path.positions_world_m, path.joined_by)
     assert steady.speeds().max() <= 0.8 * scene.finger.max_speed_m_per_s * (1.0 + 1e-9)
 
 
@@ -172,7 +172,7 @@ def test_taps_touch_as_long_and_as_often_as_people_do(
     gesture: Gesture, interval_s: float, contact_s: float
 ) -> None:
     path = gesture(SCENE)
-    motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    motion = join_points(path.times_s, path.positions_world_m, path.joined_by)
     times = np.arange(0.0, motion.duration_s, 2e-4)
     below = heights(np.array([motion.at(time)[0] for time in times]), SCENE) < 0.0
     touches = times[1:][below[1:] & ~below[:-1]]
@@ -184,7 +184,7 @@ def test_taps_touch_as_long_and_as_often_as_people_do(
 
 def test_a_stop_stops_in_50_ms_and_the_finger_then_rests() -> None:
     path = GESTURES["stop"](SCENE)
-    motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    motion = join_points(path.times_s, path.positions_world_m, path.joined_by)
     times = np.arange(1.2, motion.duration_s - 1.2, 1e-3)
     speeds = np.array([np.linalg.norm(motion.at(time)[1]) for time in times])
     going = speeds > 0.95 * speeds.max()
@@ -195,7 +195,7 @@ def test_a_stop_stops_in_50_ms_and_the_finger_then_rests() -> None:
 
 def test_a_reverse_turns_at_full_speed_within_100_ms() -> None:
     path = GESTURES["reverse"](SCENE)
-    motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    motion = join_points(path.times_s, path.positions_world_m, path.joined_by)
     times = np.arange(1.3, motion.duration_s - 1.15, 1e-3)
     around = np.array([motion.at(time)[1][1] for time in times])
     turns = np.flatnonzero(around[:-1] * around[1:] < 0)
@@ -217,7 +217,7 @@ def test_a_reach_of_least_jerk_comes_out_as_it_was_meant(way_m: float, duration_
     2 g."""
     duration_s = max(duration_s, float(np.sqrt(5.77 * way_m / 20.0)))
     times, places = minimum_jerk([0.0, 0.0, 0.0], [(duration_s, [way_m, 0.0, 0.0])])
-    motion = validate_path(times, places, "spline")
+    motion = join_points(times, places, "spline")
     between = np.linspace(0.0, duration_s, 500)
     share, rate = minimum_jerk_profile(between / duration_s)
     found = [motion.at(time) for time in between]
@@ -235,7 +235,7 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
     missed = []
     for joined_by in ("rounded_lines", "spline"):
         join: PathJoin = joined_by
-        motion = validate_path(times, places, join)
+        motion = join_points(times, places, join)
         errors = [
             motion.at(time)[0][0] - 0.05 * minimum_jerk_profile(time / 0.5)[0] for time in times
         ]
@@ -248,9 +248,9 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
 def test_halving_the_samples_changes_no_gesture(name: str) -> None:
     """The samples describe the whole motion."""
     path = GESTURES[name](SCENE)
-    whole = validate_path(path.times_s, path.positions_world_m, "spline")
+    whole = join_points(path.times_s, path.positions_world_m, "spline")
     keep = np.unique(np.append(np.arange(0, len(path.times_s), 2), len(path.times_s) - 1))
-    half = validate_path(path.times_s[keep], path.positions_world_m[keep], "spline")
+    half = join_points(path.times_s[keep], path.positions_world_m[keep], "spline")
     times = np.arange(0.0, whole.duration_s, 0.5 * SAMPLE_S)
     apart = [np.linalg.norm(whole.at(time)[0] - half.at(time)[0]) for time in times]
     # A spline's error falls with the fourth power of the step, with the third where jerk steps.
@@ -266,7 +266,7 @@ def test_no_smooth_path_is_faster_than_its_bound(
     points: list[tuple[float, float, float]], step_s: float
 ) -> None:
     times = np.linspace(0.0, step_s * (len(points) - 1), len(points))
-    path = validate_path(times, np.array(points), "spline")
+    path = join_points(times, np.array(points), "spline")
     bounds = path.speeds()
     for piece, bound in enumerate(bounds):
         inside = np.linspace(times[piece], times[piece + 1], 40)
@@ -288,7 +288,7 @@ def test_a_smooth_path_that_is_too_fast_between_its_samples_is_rejected() -> Non
 
 
 def test_one_point_is_a_rest_position_for_any_interpolation() -> None:
-    path = validate_path(np.zeros(1), np.array([[0.1, 0.0, 0.0]]), "spline")
+    path = join_points(np.zeros(1), np.array([[0.1, 0.0, 0.0]]), "spline")
     assert path.at(3.0)[0][0] == pytest.approx(0.1)
 
 

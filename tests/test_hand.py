@@ -60,7 +60,7 @@ from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.twin import finger_node
-from flexsheet.nodes.twin.finger import validate_path
+from flexsheet.nodes.twin.finger import join_points
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from flexsheet.nodes.twin.hand import (
     CoupledFinger,
@@ -267,7 +267,7 @@ def test_beside_the_end_of_the_object_no_force_is_wanted() -> None:
 def test_a_gesture_touches_as_often_as_it_says_and_ends_in_the_air(name: str) -> None:
     make_path, touches = HAND_GESTURES[name]
     path = make_path(SCENE, 0.01)
-    motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    motion = join_points(path.times_s, path.positions_world_m, path.joined_by)
     times = np.linspace(0.0, path.times_s[-1], 2000)
     points = np.array([motion.at(at)[0] for at in times])
     shape = make_shape(dict(SCENE.object.geometry))

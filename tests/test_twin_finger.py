@@ -20,6 +20,7 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Lens, Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
+from flexsheet.messages.wire import WireError, decode, encode
 from flexsheet.nodes.twin.finger import FingerMotion, FingerPathError
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from flexsheet.nodes.twin.paths import recorded_path
@@ -124,15 +125,28 @@ def test_speed_stays_below_the_paths_own() -> None:
     [
         ([], [], "at least one"),
         ([0.0, 1.0], [[0.0, 0, 0]], "one time per point"),
-        ([0.0, 1.0, 1.0], [[0.0, 0, 0]] * 3, r"times_s\[2\] = 1 does not come after"),
-        ([0.0, 0.01], [[0.0, 0, 0], [0.1, 0, 0]], r"speed 10 m/s after times_s\[0\]"),
+        ([0.0, 1.0, 1.0], [[0.0, 0, 0]] * 3, "times_s[2]: 1 does not come after"),
     ],
 )
 def test_paths_that_cannot_be_followed_are_rejected(
     times: list[float], points: list[list[float]], printed: str
 ) -> None:
-    with pytest.raises(FingerPathError, match=printed):
-        motion_along(times, points)
+    positions = np.array(points).reshape(-1, 3)
+    path = FingerPath(label="wrong", times_s=np.array(times), positions_world_m=positions)
+    assert printed in path.find_problem()
+
+
+def test_a_path_that_is_too_fast_is_rejected() -> None:
+    with pytest.raises(FingerPathError, match=r"speed 10 m/s after times_s\[0\]"):
+        motion_along([0.0, 0.01], [[0.0, 0, 0], [0.1, 0, 0]])
+
+
+@pytest.mark.parametrize("name", ["wander_m", "tremor_m"])
+def test_a_path_with_more_noise_than_a_hand_is_no_message(name: str) -> None:
+    path = FingerPath(label="wild", times_s=np.zeros(1), positions_world_m=np.zeros((1, 3)))
+    forged = path.model_copy(update={name: 1e6})
+    with pytest.raises(WireError, match=name):
+        decode(encode(forged, header()), FingerPath)
 
 
 def test_wander_and_tremor_are_as_large_and_as_fast_as_asked() -> None:

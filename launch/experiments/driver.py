@@ -43,7 +43,7 @@ from flexsheet.messages.types import (
 from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
-from flexsheet.nodes.twin.finger import FingerPathError, check_speed, validate_path
+from flexsheet.nodes.twin.finger import FingerPathError, check_speed, join_points
 
 TableMethod = Literal["quick_table", "nonlinear_table"]
 TABLE_METHODS: tuple[TableMethod, ...] = get_args(TableMethod)
@@ -361,7 +361,7 @@ class Driver:
         if problem := path.find_problem():
             raise FingerPathError(f'path "{path.label}": {problem}')
         if self._scene is not None:
-            motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+            motion = join_points(path.times_s, path.positions_world_m, path.joined_by)
             check_speed(motion, path.times_s, self._scene.finger.max_speed_m_per_s)
         self._publish("twin/finger_path", path)
 

@@ -55,7 +55,7 @@ from flexsheet.nodes.models.rigid import (
 )
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.twin.arms import PlacedArm
-from flexsheet.nodes.twin.finger import validate_path
+from flexsheet.nodes.twin.finger import join_points
 from flexsheet.nodes.twin.paths import map_to_surface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -429,7 +429,7 @@ def run_follow(
     if bag is None:
         progress("following in simulated time")
         followed = {"path": path.label, **follow_in_simulated_time(scene, path, truth)}
-        finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+        finger = join_points(path.times_s, path.positions_world_m, path.joined_by)
         times_s = np.arange(0.0, finger.duration_s, 0.5 * STEP_S)
         positions = np.array([finger.at(time_s)[0] for time_s in times_s])
     else:

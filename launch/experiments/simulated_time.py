@@ -67,7 +67,7 @@ from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.arms import ArmMechanics, PlacedArm, Servo
 from flexsheet.nodes.twin.clutter import CLUTTER
-from flexsheet.nodes.twin.finger import FingerMotion, find_tremor_m, validate_path
+from flexsheet.nodes.twin.finger import FingerMotion, find_tremor_m, join_points
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
@@ -462,7 +462,7 @@ def follow_in_simulated_time(
     `servo_lag_uncertainty_ms` contains their standard deviations.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
-    finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    finger = join_points(path.times_s, path.positions_world_m, path.joined_by)
     compliance = ComplianceController(scene, make_force_model(scene.sheet), "force_curve")
     loop = SimulatedLoop(scene, truth, given, compliance)
     times_ns: list[int] = []
@@ -623,7 +623,7 @@ def touch_in_simulated_time(
     bounds: limits of the sheet's offset along its normal, within which the planner keeps the
         control loop stable.
     """
-    voluntary = validate_path(path.times_s, path.positions_world_m, path.joined_by)
+    voluntary = join_points(path.times_s, path.positions_world_m, path.joined_by)
     compliance = ComplianceController(
         scene, make_force_model(scene.sheet), "force_curve", bounds=bounds
     )

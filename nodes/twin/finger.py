@@ -243,23 +243,8 @@ def find_clamped_rates(times_s: Floats, points: Floats) -> Floats:
     return rates
 
 
-def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
-    """Check the points (n, 3) and times (n,) of a path, and return the motion through these points.
-
-    Raises FingerPathError if the path has no points or its times do not increase.
-    """
-    if len(times_s) != len(points) or len(times_s) == 0:
-        raise FingerPathError(
-            f"the path has {len(times_s)} times and {len(points)} points; give one time per point, "
-            "and at least one point"
-        )
-    steps_s = np.diff(times_s)
-    if (steps_s <= 0).any():
-        at = int(np.argmax(steps_s <= 0))
-        raise FingerPathError(
-            f"path: times_s[{at + 1}] = {times_s[at + 1]:.6g} does not come after times_s[{at}] = "
-            f"{times_s[at]:.6g}; give increasing times"
-        )
+def join_points(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
+    """Return the motion through the points (n, 3) of a path at increasing times (n,)."""
     # At a single point the finger rests, which needs no spline.
     if joined_by == "spline" and len(points) > 1:
         return SmoothPath.through(times_s, points)
@@ -381,10 +366,9 @@ class FingerMotion:
         wander_m: standard deviation of the wander per axis.
         tremor_m: amplitude of the tremor: sqrt(2) times its standard deviation per axis.
 
-        Raises FingerPathError if the path has no points, times that do not increase, or a speed
-        above `max_speed_m_per_s`.
+        Raises FingerPathError if the path has a speed above `max_speed_m_per_s`.
         """
-        path = validate_path(times_s, points, joined_by)
+        path = join_points(times_s, points, joined_by)
         check_speed(path, times_s, max_speed_m_per_s)
         start, start_velocity, amplitudes = self._steady(at_s)
         distance_m = float(np.linalg.norm(points[0] - start))
