@@ -17,11 +17,7 @@ from flexsheet.launch.health import layout
 from flexsheet.launch.health.layout import (
     Layout,
     check_layout,
-    draw_layout,
     make_layout_result,
-    make_samples,
-    move_base,
-    sample_contacts,
 )
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_cylinder
@@ -291,7 +287,10 @@ def test_an_arm_moved_through_the_wrists_singularity_continues_and_the_check_fai
 
 def barred_scene() -> Scene:
     """Return a scene whose left base is so far away that many poses are not reachable."""
-    return move_base(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
+    content = SCENE.model_dump()
+    base = content["arms"]["left"]["world_from_base"]
+    base["position_m"] = base["position_m"] + np.array([-0.1, -0.05, 0.06])
+    return Scene.model_validate(content)
 
 
 @pytest.fixture(scope="module")
@@ -306,7 +305,6 @@ def barred() -> Layout:
 
 def test_the_demo_scene_is_within_reach(demo: Layout) -> None:
     assert demo.reachable
-    assert demo.remedies == ()
     assert demo.blocked_paths == ()
     result = make_layout_result(demo)
     assert result["fraction"] == 1.0
@@ -330,20 +328,12 @@ def test_the_samples_cover_the_working_range(demo: Layout) -> None:
     assert np.abs(along).max() <= SCENE.sheet.usable_half_height_m + 1e-9
 
 
-def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> None:
+def test_a_base_too_far_off_is_found_out(barred: Layout) -> None:
     assert not barred.reachable
     assert barred.right.reachable.all()
     assert not barred.left.reachable.all()
     binding = {one["limit"] for one in make_layout_result(barred)["arms"]["left"]["binding"]}
     assert {"reach", "J3 range"} <= binding
-    moved = [one for one in barred.remedies if "left_base_offset_m" in one.values]
-    assert len(moved) == 1
-    offset = np.array(moved[0].values["left_base_offset_m"])
-    again = move_base(barred_scene(), "left", offset)
-    reach = find_best_reach(
-        ArmGeometry(again, "left"), RIGHT, make_samples(again, sample_contacts(again)).poses
-    )
-    assert reach.reachable.all()
 
 
 def test_the_first_limiting_pose_is_the_nearest_to_the_front(barred: Layout) -> None:
@@ -353,16 +343,6 @@ def test_the_first_limiting_pose_is_the_nearest_to_the_front(barred: Layout) -> 
         assert abs(one["first_tilt_rad"]) == pytest.approx(
             float(np.abs(samples.tilt_rad[same]).min()), abs=1e-5
         )
-
-
-def test_less_tilt_helps_where_a_base_cannot() -> None:
-    arms = SCENE.arms.model_copy(update={"workspace_max_m": np.array([0.4, 0.03, 0.3])})
-    found = check_layout(SCENE.model_copy(update={"arms": arms}))
-    assert not found.reachable
-    assert {one for remedy in found.remedies for one in remedy.values} <= {
-        "tilt_rad",
-        "push_depth_m",
-    }
 
 
 def make_ball(tilt_rad: float) -> Scene:
@@ -377,60 +357,20 @@ def make_ball(tilt_rad: float) -> Scene:
     return Scene.model_validate(content)
 
 
-def test_the_largest_reachable_tilt_is_proposed() -> None:
-    found = check_layout(make_ball(0.9))
-    (remedy,) = (one for one in found.remedies if "tilt_rad" in one.values)
-    largest = remedy.values["tilt_rad"]
-    assert 0.6 <= largest < 0.9
-    degrees = np.degrees(largest)
-    assert remedy.what == f"working_range.tilt_rad: at most {largest:g} rad ({degrees:.1f} degrees)"
-    assert check_layout(make_ball(largest)).reachable
-    beyond = make_ball(largest + 0.01)
-    poses = make_samples(beyond, sample_contacts(beyond)).poses
-    left, right = ArmGeometry(beyond, "left"), ArmGeometry(beyond, "right")
-    reached = [
-        find_best_reach(*arms, poses).reachable.all() for arms in ((left, right), (right, left))
-    ]
-    assert not all(reached)
-
-
-def test_the_reach_is_reported_before_the_search_for_remedies(
-    flexsheet: Command, barred: Layout, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps: list[str] = []
-    monkeypatch.setattr(layout, "_check_reach", lambda *_: barred)
-    monkeypatch.setattr(layout, "_is_reachable", lambda scene: scene.working_range.tilt_rad < 0.1)
-    found = check_layout(
-        SCENE, progress=steps.append, on_reach=lambda one: steps.append(f"reach {one.reachable}")
-    )
-    assert steps[:2] == ["finding the contacts on the object", "reach False"]
-    tilts = [step for step in steps if "largest tilt_rad" in step]
-    assert re.fullmatch(r"searching the largest tilt_rad: [\d.]+, test 1 of at most \d", tilts[0])
-    assert len(tilts) <= int(tilts[-1][-1])
-    assert any("tilt_rad" in remedy.values for remedy in found.remedies)
-    code, _, err = flexsheet("doctor", "scene", SCENE_FILE)
-    assert code == 1
-    assert re.search(r"^not reachable: the arms reach \d+\.\d % of the working range", err, re.M)
-
-
-def test_a_speed_that_is_too_high_gives_a_warning_and_the_largest_speed(
+def test_a_speed_that_is_too_high_gives_a_warning(
     flexsheet: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ball = make_ball(0.6)
     found = check_layout(ball)
     assert found.reachable
-    (remedy,) = found.remedies
-    slower = ball.working_range.model_copy(update=remedy.values)
+    slower = ball.working_range.model_copy(update={"speed_m_per_s": found.speed_m_per_s(1.0)})
     assert slower.speed_m_per_s < ball.working_range.speed_m_per_s
-    calm = check_layout(ball.model_copy(update={"working_range": slower}))
-    assert calm.followed.all()
-    assert calm.remedies == ()
-    monkeypatch.setattr(layout, "check_layout", lambda scene, **_: found)
+    assert check_layout(ball.model_copy(update={"working_range": slower})).followed.all()
+    monkeypatch.setattr(layout, "check_layout", lambda *_: found)
     code, out, err = flexsheet("doctor", "scene", SCENE_FILE)
     assert code == 0
     assert f"flexsheet doctor compliance {SCENE_FILE}" in err
     assert re.search(r"^warning: the arms follow \d+ mm/s at only [\d.]+ % of", out, re.M)
-    assert f"remedy: {remedy.what}" in out
 
 
 @pytest.mark.parametrize(
@@ -452,26 +392,19 @@ def test_every_shape_can_be_asked(geometry: dict[str, Any], reachable: bool) -> 
     assert found.reachable is reachable
 
 
-def test_the_image_is_drawn(barred: Layout, tmp_path: Path) -> None:
-    draw_layout(barred, tmp_path / "layout.png")
-    assert (tmp_path / "layout.png").stat().st_size > 10_000
-
-
-def test_the_commands_exit_code_is_the_reachability(flexsheet: Command, tmp_path: Path) -> None:
-    picture = tmp_path / "layout.png"
-    code, out, _ = flexsheet("doctor", "scene", SCENE_FILE, "--json", "--output", picture)
+def test_the_exit_code_of_a_reachable_scene_is_0(flexsheet: Command) -> None:
+    code, out, _ = flexsheet("doctor", "scene", SCENE_FILE, "--json")
     assert code == 0
     assert json.loads(out)["reachable"] is True
-    assert picture.is_file()
 
 
-def test_the_command_fails_and_offers_a_remedy(
+def test_the_command_fails_and_names_the_limits(
     flexsheet: Command,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
     barred: Layout,
 ) -> None:
-    def known_layout(scene: Scene, **_: object) -> Layout:
+    def known_layout(scene: Scene, *_: object) -> Layout:
         moved, wanted = (one.arms.left.world_from_base for one in (scene, barred_scene()))
         assert moved.position_m == pytest.approx(wanted.position_m)
         return barred
@@ -483,18 +416,14 @@ def test_the_command_fails_and_offers_a_remedy(
     code, out, _ = flexsheet("doctor", "scene", far)
     assert code == 1
     assert re.search(r"^reachable +NO$", out, re.M)
-    assert "remedy: move the left base by" in out
-    assert re.search(r"^arm +limit +minimum margin +at tilt +depth$", out, re.M)
+    assert re.search(r"^left +reach +[\d.]+ %", out, re.M)
     assert re.search(r"^left arm's joint solution +shoulder front, elbow ", out, re.M)
-    assert "% used" not in out
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["nowhere.yaml"], "nowhere.yaml"),
-        ([SCENE_FILE, "--output", "nowhere/x.png"], "does not exist"),
-        ([SCENE_FILE, "--output", "layout.weird"], "weird"),
     ],
 )
 def test_bad_input_to_the_command_is_named(

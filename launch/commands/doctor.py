@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import JsonOption, SceneArgument, result_file
+from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
     FAILED,
-    CommandError,
     examples,
     print_fields,
     print_json,
@@ -23,7 +21,7 @@ from flexsheet.launch.commands.output import (
 from flexsheet.messages.units import format_percent
 
 if TYPE_CHECKING:
-    from flexsheet.launch.health.layout import Layout
+    pass
 
 app = typer.Typer(
     add_completion=False,
@@ -82,14 +80,10 @@ def doctor(
 
 @app.command(
     "scene",
-    epilog=examples("flexsheet doctor scene launch/scenes/cylinder.yaml -o reach.png"),
+    epilog=examples("flexsheet doctor scene launch/scenes/cylinder.yaml"),
 )
 def check_scene(
     scene_file: SceneArgument,
-    output: Annotated[
-        Path | None,
-        result_file("Image file (.png or .svg) to write with the reachable range.", "IMAGE"),
-    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check that both arms reach the whole working range of a scene.
@@ -103,21 +97,13 @@ def check_scene(
     centre is in front of the plane through the axes of J1 and J2. "Elbow up" means that J3 is
     greater than the angle at which the arm is straight. "Wrist flipped" means that J5 is negative.
     """
-    from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
+    from flexsheet.launch.health.layout import check_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
     with progress_words() as progress:
-        layout = check_layout(scene, progress=progress, on_reach=_print_reach)
+        layout = check_layout(scene, progress)
     result = make_layout_result(layout)
-    if output is not None:
-        try:
-            draw_layout(layout, output)
-        except (OSError, ValueError) as error:
-            raise CommandError(
-                f"--output {output}: cannot be written: {error}; use .png or .svg"
-            ) from error
-        words.print(f"image: {output}")
     if as_json:
         print_json(result)
     else:
@@ -129,18 +115,6 @@ def check_scene(
             )
     if not layout.reachable:
         raise typer.Exit(FAILED)
-
-
-def _print_reach(layout: Layout) -> None:
-    """Print a message if the arms do not reach the whole working range.
-
-    The message precedes the search for remedies, which can take minutes.
-    """
-    if not layout.reachable:
-        words.print(
-            f"not reachable: the arms reach {format_percent(layout.reached.mean())} of the "
-            "working range; searching for remedies, which can take minutes (Ctrl-C ends the search)"
-        )
 
 
 def _describe_branch(branch: dict[str, Any]) -> str:
@@ -191,20 +165,6 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
     if binding:
         print_table(("arm", "active limit", "samples", "first at tilt", "depth"), binding)
         print()
-    print_table(
-        ("arm", "limit", "minimum margin", "at tilt", "depth"),
-        [
-            (
-                side,
-                one["limit"],
-                _margin(one["margin"], one["unit"]),
-                f"{math.degrees(one['tilt_rad']):.1f}°",
-                f"{1e3 * one['depth_m']:.0f} mm",
-            )
-            for side, arm in arms.items()
-            for one in arm["min_margins"].values()
-        ],
-    )
     for path in result["blocked_paths"]:
         words.print(f"the arms cannot move along the path {path}")
     if result["fraction_at_working_speed"] < 1.0:
@@ -212,17 +172,3 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
             f"warning: the arms follow {1e3 * required_m_per_s:.0f} mm/s at only "
             f"{format_percent(result['fraction_at_working_speed'])} of the samples"
         )
-    for remedy in result["remedies"]:
-        print(f"remedy: {remedy['what']}")
-    if not result["reachable"] and not result["remedies"]:
-        words.print("none of the tested single changes makes the whole working range reachable")
-
-
-def _margin(value: float, unit: str) -> str:
-    shown = {
-        "rad": f"{math.degrees(value):.1f}°",
-        "m": f"{1e3 * value:.0f} mm",
-        "N": f"{value:.1f} N",
-        "ratio": f"{100 * value:.0f} %",
-    }
-    return shown[unit]

@@ -1,4 +1,4 @@
-"""Check whether two arms reach the whole working range of a scene, and suggest remedies.
+"""Check whether two arms reach the whole working range of a scene.
 
 The range is sampled over contact points on the object, sheet poses, push depths, stretches and
 motions. Some sheet poses result from rolling. In this motion, the sheet tilts over the object
@@ -9,25 +9,20 @@ node (`flexsheet.nodes.arm_bridge.reach`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Arms, ArmSpec, Pose, Scene
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Side
-from flexsheet.messages.units import format_percent
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.reach import (
     LIMITS,
-    RANGES,
     SPEED_LIMITS,
-    SPEEDS,
     ArmReach,
     PathError,
     SheetPoses,
@@ -60,23 +55,6 @@ ROLL_STARTS = 24
 
 CLAMP_MARGIN_M = 0.03
 """The minimum distance (m) between the finger and a clamped edge of the sheet."""
-
-OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
-"""The offsets (m) of an arm's base along each world axis that are tried as a remedy."""
-
-TILT_STEP_RAD, DEPTH_STEP_M, SPEED_STEP_M_PER_S = 0.01, 0.001, 1e-4
-"""The steps between the tilt ranges, push depths and speeds that are tried as remedies."""
-
-PROGRESS_STEPS = 10
-"""The maximum number of progress reports during the search for a base position."""
-
-REACHED_COLOR = "#dcefdc"
-
-THINNED_COUNT = 600
-"""The approximate number of samples with which a base position is checked first.
-
-All samples are checked only if the arm reaches these samples from the base position.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,27 +91,14 @@ class LayoutSamples:
 
 
 @dataclass(frozen=True, slots=True)
-class LayoutRemedy:
-    """A change of the scene that makes the whole working range reachable for both arms.
-
-    what: description of the change.
-    values: changed values by name.
-    """
-
-    what: str
-    values: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
 class Layout:
-    """The result of the layout check: the reach of each arm, blocked paths, and remedies."""
+    """The result of the layout check: the reach of each arm, and blocked paths."""
 
     scene: Scene
     samples: LayoutSamples
     left: ArmReach
     right: ArmReach
     blocked_paths: tuple[str, ...]
-    remedies: tuple[LayoutRemedy, ...]
 
     @property
     def reached(self) -> NDArray[np.bool_]:
@@ -298,33 +263,19 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
     )
 
 
-def check_layout(
-    scene: Scene,
-    *,
-    progress: Progress = lambda text: None,
-    on_reach: Callable[[Layout], None] = lambda layout: None,
-) -> Layout:
-    """Check whether both arms reach the working range. If not, search for remedies.
+def check_layout(scene: Scene, progress: Progress = lambda text: None) -> Layout:
+    """Check whether both arms reach the working range.
 
     progress: function that is called with a description of each step.
-    on_reach: function that is called before the search, which can take minutes. Its argument is the
-        result without remedies.
     """
     progress("finding the contacts on the object")
-    found = _check_reach(scene, sample_contacts(scene), progress)
-    on_reach(found)
-    return replace(found, remedies=tuple(_find_remedies(found, progress)))
-
-
-def _check_reach(scene: Scene, contacts: Sequence[ContactSample], progress: Progress) -> Layout:
-    """Return the result of the layout check without remedies."""
-    samples = make_samples(scene, contacts)
+    samples = make_samples(scene, sample_contacts(scene))
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
     progress(f"{len(samples.poses)} poses of the sheet, left arm")
     left_reach = find_best_reach(left, right, samples.poses)
     progress(f"{len(samples.poses)} poses of the sheet, right arm")
     right_reach = find_best_reach(right, left, samples.poses)
-    found = Layout(scene, samples, left_reach, right_reach, (), ())
+    found = Layout(scene, samples, left_reach, right_reach, ())
     progress("checking paths from the front to the limits of the range")
     return replace(found, blocked_paths=tuple(_find_blocked_paths(found, left, right)))
 
@@ -360,135 +311,6 @@ def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -
             yield f"to {tilt_deg:.0f} degrees, {depth_mm:.0f} mm deep: {error}"
 
 
-def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]:
-    """Yield changes of the scene after which the arms reach all samples.
-
-    The changes are other base positions, a smaller tilt range, or a smaller push depth. If the arms
-    reach all samples but are too slow, the change is a smaller speed.
-    """
-    if layout.reachable:
-        if not layout.followed.all():
-            speed = SPEED_STEP_M_PER_S * np.floor(layout.speed_m_per_s(1.0) / SPEED_STEP_M_PER_S)
-            yield LayoutRemedy(
-                f"working_range.speed_m_per_s: at most {speed:.4f} m/s", {"speed_m_per_s": speed}
-            )
-        return
-    moved: dict[Side, Floats] = {}
-    for side, reach in layout.arms():
-        if not reach.reachable.all():
-            offset = _find_base_offset(layout, side, progress)
-            if offset is None:
-                moved.clear()
-                break
-            moved[side] = offset
-    if moved:
-        moves = " and ".join(
-            f"{side} base by ({', '.join(f'{1e3 * one:+.0f}' for one in offset)}) mm"
-            for side, offset in moved.items()
-        )
-        yield LayoutRemedy(
-            f"move the {moves} along the world's x, y, z",
-            {f"{side}_base_offset_m": offset.tolist() for side, offset in moved.items()},
-        )
-    for key, step, unit, factor, shown in (
-        ("tilt_rad", TILT_STEP_RAD, "rad", 180.0 / np.pi, "degrees"),
-        ("push_depth_m", DEPTH_STEP_M, "m", 1e3, "mm"),
-    ):
-        largest = _find_largest(layout.scene, key, step, progress)
-        if largest is not None:
-            yield LayoutRemedy(
-                f"working_range.{key}: at most {largest:g} {unit} ({factor * largest:.1f} {shown})",
-                {key: largest},
-            )
-
-
-def _find_largest(scene: Scene, key: str, step: float, progress: Progress) -> float | None:
-    """Return the largest limit of the working range with which both arms reach all samples.
-
-    The search is a bisection over the multiples of `step` below the value in the scene. Return None
-    if all tested values are too large.
-
-    key: name of the limit in the scene, such as `tilt_rad`.
-    """
-    low, high = 0, math.ceil(round(getattr(scene.working_range, key) / step, 6))
-    number, count = 0, math.ceil(math.log2(max(high, 1)))
-    while high - low > 1:
-        number += 1
-        middle = (low + high) // 2
-        value = round(middle * step, 6)
-        progress(f"searching the largest {key}: {value:g}, test {number} of at most {count}")
-        changed = scene.working_range.model_copy(update={key: value})
-        if _is_reachable(scene.model_copy(update={"working_range": changed})):
-            low = middle
-        else:
-            high = middle
-    return round(low * step, 6) if low else None
-
-
-def _is_reachable(scene: Scene) -> bool:
-    contacts = sample_contacts(scene)
-    if not contacts:
-        return False
-    # Paths are only checked if all samples are reachable, because their check takes long.
-    poses = make_samples(scene, contacts).poses.without_twists()
-    left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
-    for arm, other in ((left, right), (right, left)):
-        if not find_best_reach(arm, other, poses).reachable.all():
-            return False
-    return _check_reach(scene, contacts, lambda text: None).reachable
-
-
-def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
-    """Return a copy of the scene with a moved base of one arm.
-
-    offset_m: displacement (3,) in the world frame.
-    """
-    arms = scene.arms
-    arm: ArmSpec = getattr(arms, side)
-    base = Pose(
-        position_m=np.asarray(arm.world_from_base.position_m) + offset_m,
-        rpy_rad=arm.world_from_base.rpy_rad,
-    )
-    changed: Arms = arms.model_copy(update={side: arm.model_copy(update={"world_from_base": base})})
-    return scene.model_copy(update={"arms": changed})
-
-
-def _find_base_offset(layout: Layout, side: Side, progress: Progress) -> Floats | None:
-    """Return the smallest base displacement (3,), in m, with which the arm reaches all samples.
-
-    Return None if no tested displacement is sufficient.
-    """
-    other: Side = "right" if side == "left" else "left"
-    reach = layout.left if side == "left" else layout.right
-    bad = np.flatnonzero(~reach.reachable)
-    good = np.flatnonzero(reach.reachable)
-    # The limits of the flange's pose do not depend on the position of the base.
-    independent_limits = {"workspace", "flange distance", "edge force"}
-    if any(LIMITS[number] in independent_limits for number in set(reach.binding[bad].tolist())):
-        return None
-    chosen = np.concatenate(
-        [
-            bad[:: max(1, 2 * len(bad) // THINNED_COUNT)],
-            good[:: max(1, 2 * len(good) // THINNED_COUNT)],
-        ]
-    )
-    thin = layout.samples.poses.some(chosen)
-    other_arm = ArmGeometry(layout.scene, other)
-    offsets = sorted(
-        (np.array(one) for one in product(OFFSETS_M, repeat=3)),
-        key=lambda one: (round(float(np.linalg.norm(one)), 6), *np.abs(one)),
-    )
-    for number, offset in enumerate(offsets[1:]):
-        if number % math.ceil(len(offsets) / PROGRESS_STEPS) == 0:
-            progress(f"searching positions of the {side} base: {100 * number // len(offsets)} %")
-        arm = ArmGeometry(move_base(layout.scene, side, offset), side)
-        if not find_best_reach(arm, other_arm, thin.without_twists()).reachable.all():
-            continue
-        if find_best_reach(arm, other_arm, layout.samples.poses.without_twists()).reachable.all():
-            return offset
-    return None
-
-
 def make_layout_result(layout: Layout) -> dict[str, Any]:
     """Return the result of `flexsheet doctor scene --json`."""
     return {
@@ -501,7 +323,6 @@ def make_layout_result(layout: Layout) -> dict[str, Any]:
         "samples": len(layout.samples.poses),
         "arms": {side: _arm_result(layout, reach) for side, reach in layout.arms()},
         "blocked_paths": list(layout.blocked_paths),
-        "remedies": [{"what": one.what, **one.values} for one in layout.remedies],
     }
 
 
@@ -513,7 +334,6 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
         "fraction_at_working_speed": float(reach.trackable.mean()),
         "branch": reach.branch._asdict(),
         "binding": [_summarize_limit(layout, number, binding) for number in present],
-        "min_margins": find_min_margins(layout, reach),
     }
 
 
@@ -538,141 +358,3 @@ def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> 
         "first_depth_m": float(samples.depth_m[first]),
         "first_contact_world_m": samples.contact_world_m[first].tolist(),
     }
-
-
-def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float | str]]:
-    """Return the minimum margin of each kind of limit, and the sample that has this margin.
-
-    For each kind, the result contains the limit, the margin with its unit, and the tilt (rad) and
-    push depth (m) of the sample.
-    """
-    kinds = {
-        "joint range": (RANGES, "rad"),
-        "shoulder singularity": (("shoulder singularity",), "m"),
-        "elbow singularity": (("elbow singularity",), "rad"),
-        "wrist singularity": (("wrist singularity",), "rad"),
-        "singularity": (("singularity",), "ratio"),
-        "workspace": (("workspace",), "m"),
-        "flange distance": (("flange distance",), "m"),
-        "edge force": (("edge force",), "N"),
-        "joint speed": (SPEEDS, "ratio"),
-        "tool speed": (("tool speed",), "ratio"),
-    }
-    result: dict[str, dict[str, float | str]] = {}
-    for kind, (limits, unit) in kinds.items():
-        values = np.stack([reach.margins[limit] for limit in limits])
-        if not np.isfinite(values).any():
-            continue
-        limit, sample = np.unravel_index(np.nanargmin(values), values.shape)
-        result[kind] = {
-            "limit": limits[int(limit)],
-            "margin": float(values[limit, sample]),
-            "unit": unit,
-            "tilt_rad": float(layout.samples.tilt_rad[sample]),
-            "depth_m": float(layout.samples.depth_m[sample]),
-        }
-    return result
-
-
-def draw_layout(layout: Layout, path: Path) -> None:
-    """Draw the limits that each arm violates, and the finger speeds that each arm can follow.
-
-    The axes of the image are the tilt of the contact and the push depth.
-
-    path: image file to write.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-
-    figure = Figure(figsize=(11, 7.5), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    grid = _TiltDepthGrid.from_layout(layout)
-    present = {int(n) for _, reach in layout.arms() for n in set(_binding_limits(reach).tolist())}
-    colors = {n: f"C{i % 10}" for i, n in enumerate(sorted(present - {-1}))}
-    required = 1e3 * layout.scene.working_range.speed_m_per_s
-    for column, (side, reach) in enumerate(layout.arms()):
-        upper, lower = panels[0, column], panels[1, column]
-        upper.imshow(grid.colored(_binding_limits(reach), colors), **grid.frame)
-        upper.set_title(f"{side} arm: reaches {format_percent(reach.reachable.mean())}")
-        speeds = np.where(reach.reachable, 1e3 * layout.speeds_m_per_s(reach), np.nan)
-        shown = lower.imshow(grid.minimum(speeds), vmin=0.0, vmax=2.0 * required, **grid.frame)
-        followed = format_percent(reach.trackable.mean())
-        lower.set_title(f"{side} arm: follows {required:.0f} mm/s at {followed}")
-        lower.set_xlabel("tilt of the contact, degrees (positive: facing up)")
-        panels[column, 0].set_ylabel("push depth, mm")
-    figure.colorbar(shown, ax=panels[1], label="speed of the finger that the arm can follow, mm/s")
-    legend = [Patch(color=REACHED_COLOR, label="reached")]
-    legend += [Patch(color=color, label=LIMITS[n]) for n, color in colors.items()]
-    panels[0, 1].legend(handles=legend, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    figure.suptitle(
-        f"{layout.scene.name}: both arms reach {format_percent(layout.reached.mean())} of the "
-        "working range"
-    )
-    figure.savefig(path, dpi=100)
-
-
-def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index (n,) of the limit that each of n samples violates most, or -1 if none."""
-    return np.where(reach.reachable, -1, reach.binding)
-
-
-@dataclass(frozen=True, slots=True)
-class _TiltDepthGrid:
-    """A grid over the tilt and push depth of the n sampled contacts of a layout.
-
-    rows, columns: row and column (n,) of the grid cell that contains each sample.
-    frame: options for drawing the grid with Matplotlib's `imshow`.
-    """
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    frame: dict[str, Any]
-
-    @classmethod
-    def from_layout(cls, layout: Layout) -> _TiltDepthGrid:
-        tilt, depth = layout.samples.tilt_rad, layout.samples.depth_m
-        most = layout.scene.working_range.tilt_rad
-        deepest = layout.scene.working_range.push_depth_m
-        columns = np.rint((tilt + most) / (2.0 * most) * (TILTS - 1)).astype(np.intp)
-        rows = np.rint(depth / deepest * (DEPTHS - 1)).astype(np.intp)
-        wide, high = np.degrees(most) / (TILTS - 1), 0.5e3 * deepest / (DEPTHS - 1)
-        extent = (-np.degrees(most) - wide, np.degrees(most) + wide, -high, 1e3 * deepest + high)
-        frame = {"origin": "lower", "aspect": "auto", "extent": extent}
-        return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
-
-    def minimum(self, values: Floats) -> Floats:
-        """Return the minimum of the values in each grid cell, as an array (DEPTHS, TILTS).
-
-        The minimum is NaN in cells that contain no value.
-
-        values: value (n,) of each of n samples.
-        """
-        cells = np.full((DEPTHS, TILTS), np.inf)
-        finite = np.isfinite(values)
-        np.minimum.at(cells, (self.rows[finite], self.columns[finite]), values[finite])
-        return np.where(np.isfinite(cells), cells, np.nan)
-
-    def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Return the red, green and blue values of each grid cell, as an array (DEPTHS, TILTS, 3).
-
-        The colour represents the limit that is violated most often in the cell. The colour is paler
-        if fewer samples violate a limit.
-
-        binding: for each of n samples, index (n,) of the limit that is violated most; -1 for
-            reachable samples.
-        colors: colour of each limit, by index.
-        """
-        from matplotlib.colors import to_rgb
-
-        cells = np.ones((DEPTHS, TILTS, 3))
-        for row, column in product(range(DEPTHS), range(TILTS)):
-            here = binding[(self.rows == row) & (self.columns == column)]
-            if len(here) == 0:
-                continue
-            cells[row, column] = to_rgb(REACHED_COLOR)
-            out = here[here >= 0]
-            if len(out):
-                weight = 0.3 + 0.7 * len(out) / len(here)
-                worst = np.array(to_rgb(colors[int(np.bincount(out).argmax())]))
-                cells[row, column] = (1.0 - weight) * cells[row, column] + weight * worst
-        return cells

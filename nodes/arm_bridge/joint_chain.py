@@ -66,7 +66,7 @@ class UnreachableError(FlexsheetError, ValueError):
     """
 
     code = "unreachable"
-    remedy = "Run `flexsheet doctor scene SCENE`, which lists the limits and possible changes."
+    remedy = "Run `flexsheet doctor scene SCENE`, which lists the limits."
 
     def __init__(self, text: str, limit: str) -> None:
         super().__init__(text)
