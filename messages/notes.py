@@ -137,12 +137,6 @@ SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "servo_lag": "the lag of the arm differs from the configured lag",
     "sheet_stiffness": "the sheet is not as stiff as the scene states",
     "arm_not_following": "the arm does not execute the commanded motion",
-    "projector_moved": "the projector's pose or lens differs from the scene",
-    "arm_base_moved": "the sheet is not where the arms' poses say: a base or a clamp has moved",
-    "camera_or_projector_moved": "the stereo camera or the projector is not where the scene says",
-    "camera_or_arm_base_moved": "the stereo camera or the base of an arm is not where the scene "
-    "says",
-    "display_latency": "projected images appear later than assumed",
 }
 """The description of each suspected cause of a deviation from expected values."""
 
@@ -156,14 +150,6 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "sheet_stiffness": "Set `sheet.young_modulus_pa` of the scene to the calibrated stiffness "
     "(N/m) divided by the thickness, or calibrate the sheet again.",
     "arm_not_following": "Check the arm for a collision, its load, and the backlash of its gears.",
-    "projector_moved": "Fasten the projector, and run `flexsheet calibrate projector`.",
-    "arm_base_moved": "Check the clamps, and calibrate the bases of the arms again "
-    "(docs/set-up-arms.md).",
-    "camera_or_projector_moved": "Set `reference_marks_world_m` of the triangulator to find out "
-    "which has moved, or calibrate both again.",
-    "camera_or_arm_base_moved": "Set `reference_marks_world_m` of the triangulator to find out "
-    "which has moved, or calibrate both again.",
-    "display_latency": "Set `display_latency_s` of the renderer to the measured latency.",
 }
 """The remedy for each suspected cause of a deviation from expected values."""
 

@@ -544,12 +544,6 @@ class Projector(Part):
     height_px: Annotated[int, Field(gt=0)]
     lens: Lens
     world_from_projector: Pose
-    check_marks_sheet_m: tuple[tuple[Finite, Finite], ...] = Field(
-        default=(),
-        max_length=8,
-        description="points (x, y) of the sheet, m, onto which bright marks are projected, so "
-        "that the stereo camera checks projector, arms and marker; empty: no marks are projected",
-    )
 
 
 class Eyes(Part):
@@ -689,14 +683,6 @@ def require_projector(scene: Scene) -> Projector:
     if scene.projector is None:
         raise MissingPartError(f'scene "{scene.name}": the key `projector` is missing')
     return scene.projector
-
-
-def shows_check_marks(scene: Scene) -> bool:
-    """Return whether the projector draws check marks on the sheet.
-
-    The stereo camera uses these projected marks to check the calibrations.
-    """
-    return scene.projector is not None and bool(scene.projector.check_marks_sheet_m)
 
 
 def require_material(scene: Scene) -> Material:

@@ -441,19 +441,6 @@ class Frame(Message):
         default=0.0,
         description="fraction of the sheet's visible area that is unlit because of folds",
     )
-    marks_px: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks", 2))] = Field(
-        default_factory=lambda: np.zeros((0, 2)),
-        description="projector pixels of the centres of the projected check marks",
-    )
-    marks_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks", 3))] = Field(
-        default_factory=lambda: np.zeros((0, 3)),
-        description="expected positions of these marks on the sheet at `predicted_to_ns`, m",
-    )
-    marks_finger_ratio: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks",))] = Field(
-        default_factory=lambda: np.zeros(0),
-        description="displacement of the sheet at these marks, along its normal, divided "
-        "by the displacement of the fingertip; 0 if there is no contact",
-    )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector image (mono or packed stereo), top row first; empty if the "
         "message has no image"
@@ -580,16 +567,10 @@ SuspectedCause = Literal[
     "servo_lag",
     "arm_not_following",
     "sheet_stiffness",
-    "projector_moved",
-    "arm_base_moved",
-    "camera_or_projector_moved",
-    "camera_or_arm_base_moved",
-    "display_latency",
 ]
 """The suspected cause of a deviation between a measured and an expected value.
 
-`flexsheet.messages.notes` describes each cause. If a value contains "or", the data cannot
-distinguish the two causes.
+`flexsheet.messages.notes` describes each cause.
 """
 
 

@@ -161,11 +161,11 @@ def test_a_host_with_other_code_may_report_topics_unknown_here(
 
 
 def test_a_port_that_is_not_connected_needs_no_messages(three: ResolvedGraph) -> None:
-    (frame,) = (one for one in three.nodes["triangulator"].inputs if one.topic == "frame")
-    assert frame.endpoints == ()
+    (arms,) = (one for one in three.nodes["twin_finger"].inputs if one.topic == "twin/arms")
+    assert arms.endpoints == ()
     probes = good(three)
-    status = make_status("triangulator", port("fingertip", 60.0), inputs=(port("frame", 0.0),))
-    probes["main"].nodes["triangulator"] = status
+    status = make_status("twin_finger", port("twin/finger", 60.0), inputs=(port("twin/arms", 0.0),))
+    probes["main"].nodes["twin_finger"] = status
     assert bad(evaluate_probes(three, "main", probes)) == []
 
 

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 
 from benchmarks.image_correction import CorrectionBench
+from flexsheet.messages.apparatus import NOMINAL_DISPLAY_LATENCY_S, nominal_apparatus
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display, Frame, TwinArms, TwinEye
 from flexsheet.nodes.arrays import Image
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
+from flexsheet.nodes.models.shapes.triangles import intersect_rays
 from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 from flexsheet.nodes.renderer.benchmarks import roll_sheet
+from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.sheet import SheetPose
 from flexsheet.nodes.twin.eye import (
     METRES_PER_PX,
@@ -31,6 +34,7 @@ from flexsheet.nodes.twin.eye import (
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.membrane import DeformedSheet
 from flexsheet.nodes.twin.true_object import TrueBody
+from flexsheet.nodes.twin.truth import find_display_delay_s
 from tests.node_harness import NodeHarness
 from tests.scenes import load_cylinder
 
@@ -369,3 +373,27 @@ async def test_eye_node_waits_for_the_scene(scene: Scene) -> None:
     assert "waits for the scene" in bench.node.note
     await bench.node.close()
     assert bench.sent == []
+
+
+def test_rays_hit_the_nearest_point_of_their_triangle_or_nothing() -> None:
+    square = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
+    rays = np.array([[0.2, 0.3, -1.0], [0.7, 0.8, -1.0], [3.0, 0.0, -1.0]])
+    triangles, weights = intersect_rays(np.array([0.0, 0.0, 1.0]), rays, square)
+    points = np.einsum("nk,nki->ni", weights, square[triangles])
+    np.testing.assert_allclose(points[:2], [[0.2, 0.3, 0.0], [0.7, 0.8, 0.0]], atol=1e-12)
+    assert np.isnan(points[2]).all()
+
+
+@pytest.mark.parametrize(("assumed_s", "late_s"), [(0.008, 0.02), (0.028, 0.0), (0.03, -0.002)])
+def test_the_true_display_time_does_not_depend_on_the_assumed_latency(
+    assumed_s: float, late_s: float
+) -> None:
+    apparatus = nominal_apparatus(load_cylinder())
+    projector = apparatus.projector.model_copy(update={"latency_offset_s": 0.02})
+    apparatus = apparatus.model_copy(update={"projector": projector})
+    frame = Frame.model_construct(
+        drawn_ns=1_000, swapped_ns=0, light_ns=1_000 + round(1e9 * assumed_s)
+    )
+    assert find_display_delay_s(frame, apparatus) == pytest.approx(late_s)
+    assert find_display_delay_s(frame, None) == 0.0
+    assert RendererParameters().display_latency_s == NOMINAL_DISPLAY_LATENCY_S

@@ -383,13 +383,12 @@ def test_doctor_and_console_show_the_cause_with_its_remedy() -> None:
 def test_doctor_says_which_parameters_the_checks_need() -> None:
     plan = load_graph(Path("launch") / "demo.yaml")
     probe = HostProbe("main", Reachability.RESPONDING)
-    (found,) = check_apparatus(probe, list(plan.nodes.values()), plan.scene_message())
+    (found,) = check_apparatus(probe, list(plan.nodes.values()))
     assert found.state == "ok"
     for parameter in (
         "reference_marks_world_m",
         "touch_point_world_m",
         "sheet_calibration",
-        "check_marks_sheet_m",
     ):
         assert parameter in found.what
 

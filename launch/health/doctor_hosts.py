@@ -33,7 +33,6 @@ from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
 from flexsheet.messages.busy import describe_busy, describe_busy_remedy, describe_pressure, is_busy
 from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
-from flexsheet.messages.scene import Scene, shows_check_marks
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
@@ -157,7 +156,7 @@ def evaluate_probes(
         found.append(_check_nodes(plan, probe))
         found.append(_check_rates(plan, probe))
         found += _check_devices(plan.nodes_on(host), probe)
-        found += check_apparatus(probe, plan.nodes_on(host), plan.scene_message())
+        found += check_apparatus(probe, plan.nodes_on(host))
         found += _check_resources(probe)
     return found
 
@@ -173,9 +172,7 @@ Each key is the node parameter that enables the self-check.
 """
 
 
-def check_apparatus(
-    probe: HostProbe, nodes: Sequence[ResolvedNode], scene: Scene | None = None
-) -> Iterator[HostFinding]:
+def check_apparatus(probe: HostProbe, nodes: Sequence[ResolvedNode]) -> Iterator[HostFinding]:
     """Yield the results of the nodes' self-checks, which detect errors of the calibration.
 
     Each suspected error is a finding. If no error is suspected, the finding lists the self-checks
@@ -194,9 +191,6 @@ def check_apparatus(
         for parameter, subject in REQUIRED_FOR_CHECKS.items()
         if parameter in node.parameters and not node.parameters[parameter]
     ]
-    projects = scene is not None and scene.projector is not None and not shows_check_marks(scene)
-    if projects and any("reference_marks_world_m" in node.parameters for node in nodes):
-        missing.append("projector and arm bases: set `projector.check_marks_sheet_m` of the scene")
     if not suspected and (checks or missing):
         unchecked = (f"no check of {one}" for one in missing)
         text = "; ".join([f"{len(checks)} residuals as expected", *unchecked])

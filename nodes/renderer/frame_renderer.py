@@ -18,14 +18,12 @@ from flexsheet.messages.types import (
     SoftBody,
 )
 from flexsheet.nodes.node import Input
-from flexsheet.nodes.renderer.check_marks import NO_MARKS, CheckMarks
 from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
 from flexsheet.nodes.renderer.eye_predictor import EyePredictor
 from flexsheet.nodes.renderer.max_age import MaxAge
 from flexsheet.nodes.renderer.output import both_eyes, select_drawn_eyes, select_eyes, which_eye
 from flexsheet.nodes.renderer.output_window import OutputWindow
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
-from flexsheet.nodes.renderer.sheet import SheetPose
 from flexsheet.nodes.renderer.sheet_pose_predictor import SheetPosePredictor, predict_fingertip
 from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
 
@@ -36,10 +34,6 @@ pixel."""
 FLANGE_TO_SHEET_M = 0.15
 """The maximum distance (m) between a point on the sheet's edge and the flange of the arm that holds
 the edge."""
-
-CHECK_MARKS_PERIOD_NS = 200_000_000
-"""The minimum time (ns) between two computations of the projected check marks. With this period,
-the computations use at most 1 % of a processor core."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +71,6 @@ class FrameRenderer:
         self.eye_predictor = EyePredictor(max_age)
         self.extrapolator = SkinExtrapolator()
         self._number = 0
-        self._check_marks_due_ns = 0
         self._drawn_of: tuple[object, ...] = ()
         self._drawn_arms: tuple[ArmState | None, ArmState | None] = (None, None)
         if ports.soft_body.message is not None and ports.soft_body.header is not None:
@@ -123,7 +116,6 @@ class FrameRenderer:
             eye=eyes.centre_world_m,
         )
         self._number += 1
-        marks = self._place_check_marks(sheet, begun_ns)
         pair = both_eyes(eyes, shown.stereo, across)
         which = which_eye(shown.stereo, self._number, shows_both=self._output.shows_both)
         image = scene_renderer.draw(
@@ -160,21 +152,9 @@ class FrameRenderer:
             shaped_for_ns=shaped_for_ns,
             fingertip_world_m=np.zeros((0, 3)) if finger_tip is None else finger_tip[None],
             occluded_fraction=scene_renderer.occluded_fraction,
-            marks_px=marks.centres_px,
-            marks_world_m=marks.world_m,
-            marks_finger_ratio=marks.finger_ratio,
             pixels=() if image is None else (image,),
         )
         return frame, source_ns
-
-    def _place_check_marks(self, sheet: SheetPose, now_ns: int) -> CheckMarks:
-        projector = self.scene_renderer.scene.projector
-        if projector is None or not projector.check_marks_sheet_m:
-            return NO_MARKS
-        if now_ns < self._check_marks_due_ns:
-            return NO_MARKS
-        self._check_marks_due_ns = now_ns + CHECK_MARKS_PERIOD_NS
-        return self.scene_renderer.place_check_marks(sheet)
 
     def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
         """Add the measured display times to the message of a frame, and return the message.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import product
 
 import moderngl
@@ -20,12 +19,6 @@ from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import corners
 from flexsheet.nodes.models.sheet.indentation import IndentationBasis
-from flexsheet.nodes.renderer.check_marks import (
-    FINGER_STEP_M,
-    NO_MARKS,
-    CheckMarks,
-    place_marks,
-)
 from flexsheet.nodes.renderer.correction import (
     NEAR_M,
     ProjectionScreen,
@@ -140,7 +133,6 @@ class SceneRenderer:
         self.canvas = Canvas(context, size, self._surface, self._material(), samples=samples)
         self.basis, self.sheet_shape, self.note = basis, sheet_shape, ""
         self.occluded_fraction = 0.0
-        self.check_marks = NO_MARKS
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
         oversampling = OVERSAMPLING if first_pass else UNSAMPLED_OVERSAMPLING
@@ -286,29 +278,6 @@ class SceneRenderer:
             display, draw_eye, multisampled=True, read=read, eyes=eyes, drawn=drawn
         )
 
-    def place_check_marks(self, sheet: SheetPose) -> CheckMarks:
-        """Place the marks that check the calibrations; the next images contain these marks."""
-        note, pushed_point, deeper = self.note, sheet.pushed_point, None
-        if pushed_point is not None and self.sheet_shape == "reduced_order" and self.basis:
-            deeper_point = pushed_point - FINGER_STEP_M * sheet.world_from_sheet[:3, 2]
-            deeper = self.sheet_mesh(replace(sheet, pushed_point=deeper_point))
-        mesh = self.sheet_mesh(sheet)
-        self.note = note
-        projector = require_projector(self.scene)
-        self.check_marks = place_marks(projector, sheet.world_from_sheet, mesh, deeper)
-        return self.check_marks
-
-    def _draw_check_marks(self, part: ImagePart) -> None:
-        canvas, (left, bottom, width, height) = self.canvas, part.viewport
-        scale = np.array([width / canvas.width_px, height / canvas.height_px])
-        side_px = self.check_marks.side_px
-        size = np.rint(side_px * scale).astype(int)
-        for column, row in self.check_marks.corners_px.tolist():
-            low = np.rint(scale * [column, canvas.height_px - row - side_px]).astype(int)
-            if (low >= 0).all() and (low + size <= (width, height)).all():
-                square = (left + int(low[0]), bottom + int(low[1]), int(size[0]), int(size[1]))
-                canvas.target.clear(1.0, 1.0, 1.0, viewport=square)
-
     def draw_onto(
         self,
         display: Display,
@@ -376,7 +345,6 @@ class SceneRenderer:
             # Do not wait between the eyes: a software driver then works on both at the same time.
             for eye, part in zip(eyes[first:], parts, strict=False):
                 draw_eye(eye, part)
-                self._draw_check_marks(part)
             canvas.resolve()
             drawn(number)
             if read and number == shown:

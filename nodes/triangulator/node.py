@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -20,11 +20,10 @@ from flexsheet.messages.marker_calibration import (
     refuse_other_marker,
 )
 from flexsheet.messages.methods import resolve_method
-from flexsheet.messages.scene import Scene, shows_check_marks
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     Fingertip,
     FingertipReason,
-    Frame,
     ParameterChange,
     StereoPair,
 )
@@ -84,7 +83,6 @@ class Triangulator(Node):
     touches the sheet. The offset between marker and fingertip is assumed to be constant.
     """
 
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})
     watched_inputs: ClassVar[frozenset[str]] = frozenset({"stereo"})
     ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"track_timeout_s"})
@@ -92,7 +90,6 @@ class Triangulator(Node):
     parameters: TriangulatorParameters
     scene: Input[Scene]
     stereo: Input[StereoPair]
-    frame: Input[Frame]
     parameter: Input[ParameterChange]
     fingertip: Output[Fingertip]
 
@@ -100,10 +97,6 @@ class Triangulator(Node):
     marker_calibration: MarkerCalibration | None = None
     geometry: StereoGeometry | None = None
     epoch, late = 0, 0
-
-    @classmethod
-    def unused_inputs(cls, parameters: Any, scene: Scene) -> frozenset[str]:
-        return frozenset() if shows_check_marks(scene) else frozenset({"frame"})
 
     async def setup(self) -> None:
         # SciPy imports a submodule on first use, which must not delay an image.
@@ -151,14 +144,9 @@ class Triangulator(Node):
         self._check = CameraCheck(
             np.array(p.reference_marks_world_m, dtype=np.float64),
             None if touch_point is None else np.array(touch_point),
-            scene.projector,
         )
         self._period = MeasuredPeriod(1.0 / scene.camera.rate_hz)
         self._restart(self.epoch)
-
-    def on_frame(self, frame: Frame, header: Header) -> None:
-        if self.geometry is not None:
-            self._check.on_frame(frame)
 
     def _adapt_timeout(self, source_ns: int) -> None:
         timeout_s = max(

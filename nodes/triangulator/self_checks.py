@@ -13,12 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexsheet.messages.scene import Projector
-from flexsheet.messages.types import Frame, SelfCheck
+from flexsheet.messages.types import SelfCheck, SuspectedCause
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.triangulator.fingertip import StereoDetection
-from flexsheet.nodes.triangulator.projection_check import ProjectionCheck, make_check
 
 REPROJECTION_THRESHOLD_PX = 0.2
 """The maximum mean reprojection error. After a calibration, the error is 0.024 px. A drift of one
@@ -52,41 +50,21 @@ class CameraCheck:
     reference_marks: world positions (n, 3), m, of fixed marks that look like the finger's marker.
     touch_point: world position (3,), m, of a known point that the finger can touch; None if no
         point is known.
-    projector: projector of the scene, which can draw marks on the sheet to check the calibrations;
-        None if the scene has no projector.
     """
 
-    def __init__(
-        self,
-        reference_marks: Floats,
-        touch_point: Floats | None,
-        projector: Projector | None = None,
-    ) -> None:
+    def __init__(self, reference_marks: Floats, touch_point: Floats | None) -> None:
         self._marks, self._touch_point = reference_marks.reshape(-1, 3), touch_point
-        self._projection = ProjectionCheck(projector)
         self._reprojection = ResidualMonitor(1, threshold=REPROJECTION_THRESHOLD_PX)
         self._camera = ResidualMonitor(3, threshold=MARK_THRESHOLD_M)
         self._marker = ResidualMonitor(3, threshold=MARKER_THRESHOLD_M, memory_s=1.0, confirm_s=0.5)
         self._resting: deque[tuple[int, Floats]] = deque()
 
-    def on_frame(self, frame: Frame) -> None:
-        """Store where the currently projected frame contains check marks (small bright dots)."""
-        self._projection.on_frame(frame)
-
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:
-        """Check the positions of the fixed marks and of the projected marks.
+        """Check the positions of the fixed marks.
 
         points: world positions (3,), m, of all bright points in an image pair.
         at_ns: time of the image pair.
         """
-        self._check_reference_marks(points, at_ns)
-        self._projection.on_points(points, self._camera_shift_m, at_ns)
-
-    @property
-    def _camera_shift_m(self) -> Floats:
-        return self._camera.mean if self._camera.has_data else np.zeros(3)
-
-    def _check_reference_marks(self, points: Sequence[Floats], at_ns: int) -> None:
         if not len(self._marks) or not points:
             return
         found = np.stack(points)
@@ -100,19 +78,18 @@ class CameraCheck:
             self._camera.add(np.median(offsets[rows, nearest][seen], axis=0), at_ns)
 
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
-        """Remove the fixed marks and the projected marks from a detection.
+        """Remove the fixed marks from a detection.
 
         These marks look like the finger's marker, but are not clutter.
 
         tracked: whether the position of the finger was predicted. In this case, markers near the
             prediction are not removed.
         """
-        marks = np.concatenate([self._marks, self._projection.expected_world_m])
-        if not len(marks):
+        if not len(self._marks):
             return detection
 
         def is_mark(point: Floats) -> bool:
-            return bool((np.linalg.norm(marks - point, axis=1) <= MARK_RADIUS_M).any())
+            return bool((np.linalg.norm(self._marks - point, axis=1) <= MARK_RADIUS_M).any())
 
         markers = detection.markers
         if not tracked:
@@ -140,18 +117,25 @@ class CameraCheck:
         offsets = np.stack([one for _, one in self._resting])
         if span_s < 0.8 * STILL_S or float(offsets.std(axis=0).max()) > STILL_M:
             return
-        self._marker.add(offset - self._camera_shift_m, at_ns)
+        camera_shift_m = self._camera.mean if self._camera.has_data else np.zeros(3)
+        self._marker.add(offset - camera_shift_m, at_ns)
 
     def results(self) -> tuple[SelfCheck, ...]:
         """Return the results of all checks that have enough data."""
-        by_marks = self._projection.results(camera_checked=self._camera.has_data)
-        found = []
-        if self._reprojection.has_data:
-            found.append(make_check("cameras_misaligned", self._reprojection))
-        if self._camera.has_data:
-            found.append(make_check("camera_moved", self._camera))
-        if self._marker.has_data:
-            # The known point shows the offset in all directions, the sheet only along its normal.
-            found.append(make_check("marker_offset", self._marker))
-            by_marks.pop("marker_offset", None)
-        return (*found, *by_marks.values())
+        checks: tuple[tuple[SuspectedCause, ResidualMonitor], ...] = (
+            ("cameras_misaligned", self._reprojection),
+            ("camera_moved", self._camera),
+            ("marker_offset", self._marker),
+        )
+        return tuple(
+            SelfCheck(
+                cause=cause,
+                unit="px" if monitor is self._reprojection else "m",
+                value=monitor.deviation,
+                expected=0.0,
+                threshold=monitor.threshold,
+                suspected=monitor.suspected,
+            )
+            for cause, monitor in checks
+            if monitor.has_data
+        )

@@ -19,8 +19,8 @@ from pydantic import Field
 
 from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.base import Header
-from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
-from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
+from flexsheet.messages.scene import NonNegative, Scene
+from flexsheet.messages.types import FingerPath, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.node import Input, Node, Output
@@ -32,9 +32,8 @@ from flexsheet.nodes.twin.finger import (
     find_tremor_m,
 )
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, HandImpedance, TrueSheet
-from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.nail import Nail
-from flexsheet.nodes.twin.pixels import NO_POINTS, TwinCamera
+from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.sheet_pull import find_clamps
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
@@ -81,11 +80,10 @@ class TwinFingerNode(Node):
     """A node that moves a simulated finger along its path and renders stereo images."""
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
-    optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame", "twin__arms"})
+    optional_inputs: ClassVar[frozenset[str]] = frozenset({"twin__arms"})
     late_modules: ClassVar[tuple[str, ...]] = ("scipy.special",)
     parameters: TwinFingerParameters
     scene: Input[Scene]
-    frame: Input[Frame]
     twin__arms: Input[TwinArms]
     twin__finger_path: Input[FingerPath]
     twin__finger: Output[TwinFinger]
@@ -101,7 +99,6 @@ class TwinFingerNode(Node):
     missed_frames = 0
     coupled: CoupledFinger | None = None
     preparing: asyncio.Task[None] | None = None
-    lit_marks: LitMarks | None = None
     waiting: FingerPath | None = None
 
     @cached_property
@@ -111,9 +108,7 @@ class TwinFingerNode(Node):
 
     @classmethod
     def unused_inputs(cls, parameters: TwinFingerParameters, scene: Scene) -> frozenset[str]:
-        if shows_check_marks(scene):
-            return frozenset()
-        return frozenset({"frame"} if parameters.hand == "coupled" else cls.optional_inputs)
+        return frozenset() if parameters.hand == "coupled" else cls.optional_inputs
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
@@ -132,8 +127,6 @@ class TwinFingerNode(Node):
             if task is not None:
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
-        if self.lit_marks is not None:
-            self.lit_marks.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         truth = self.parameters.apparatus
@@ -150,9 +143,6 @@ class TwinFingerNode(Node):
             nail=None if truth is None else Nail.of(truth.finger),
             skew_s=0.0 if truth is None else truth.camera.skew_s,
         )
-        if self.lit_marks is not None:
-            self.lit_marks.close()
-        self.lit_marks = LitMarks(true_scene, truth) if shows_check_marks(true_scene) else None
         self.max_speed_m_per_s = true_scene.finger.max_speed_m_per_s
         self.period_ns = round(1e9 / true_scene.camera.rate_hz)
         self.exposure_ns = round(1e9 * true_scene.camera.exposure_s)
@@ -205,10 +195,6 @@ class TwinFingerNode(Node):
         self.edges.add(at_s, left @ self.clamps[0], right @ self.clamps[1])
         if self.edges:
             self.coupled.advance(at_s, self.edges)
-
-    def on_frame(self, frame: Frame, header: Header) -> None:
-        if self.lit_marks is not None:
-            self.lit_marks.on_frame(frame)
 
     def on_twin__finger_path(self, path: FingerPath, header: Header) -> None:
         coupled = self.parameters.hand == "prescribed" or self.coupled is not None
@@ -282,7 +268,6 @@ class TwinFingerNode(Node):
             self._track(exposed_ns),
             exposure_s=self.exposure_ns * 1e-9,
             time_s=exposed_ns * 1e-9,
-            lit_points=self._lit_points(exposed_ns, state.position),
         )
         return StereoPair(
             device=self.camera.camera.device,
@@ -298,13 +283,6 @@ class TwinFingerNode(Node):
             return lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position
         seen = self.truth(exposed_ns)
         return lambda offset_s: seen.position + offset_s * seen.velocity
-
-    def _lit_points(self, at_ns: int, finger: Floats) -> Floats:
-        """Return the points (n, 3) of the sheet at which projected check marks are visible."""
-        arms = self.twin__arms.message
-        if self.lit_marks is None or arms is None:
-            return NO_POINTS
-        return self.lit_marks.light(arms, finger, at_ns)
 
     def _stamp_error_ns(self) -> int:
         if self.parameters.apparatus is None:
