@@ -162,9 +162,8 @@ docs: setup $(SITE_STAMP)  ## build the documentation site, site/index.html
 BUILD = $(CURDIR)/$(BIN)/python -c "import sys; from setuptools import build_meta; \
 	getattr(build_meta, sys.argv[1])(sys.argv[2])"
 release: setup  ## write source archive, wheel and checksums to dist/
-	rm -rf dist share build/source
-	mkdir -p share/man/man1 build/source dist
-	$(BIN)/flexsheet man > share/man/man1/flexsheet.1
+	rm -rf dist build/source
+	mkdir -p build/source dist
 	$(BUILD) build_sdist dist > build/release.log
 	tar --extract --directory build/source --strip-components 1 --file dist/*.tar.gz
 	cd build/source && $(BUILD) build_wheel $(CURDIR)/dist >> $(CURDIR)/build/release.log
@@ -175,5 +174,5 @@ release: setup  ## write source archive, wheel and checksums to dist/
 	@ls -1 dist
 
 clean:  ## remove everything that the other targets have made
-	rm -rf $(VENV) $(SITE_VENV) site .cache build dist share runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(SITE_VENV) site .cache build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

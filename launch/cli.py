@@ -18,10 +18,10 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from flexsheet.launch.commands.options import FORMER_NAMES, name_values
-from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError, examples, words
-from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import DISK_ERRORS, FileWriteError, make_write_error
+from flexsheet.launch.commands.options import name_values
+from flexsheet.launch.commands.output import FAILED, examples, words
+from flexsheet.messages.errors import FlexsheetError, describe_error
+from flexsheet.messages.files import DISK_ERRORS, make_write_error
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "try": ("trying",),
@@ -30,7 +30,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "stop": ("session:stop_app",),
     "status": ("session:status_app",),
     "logs": ("session:logs_app",),
-    "graph": ("drawing",),
     "view": ("view",),
     "node": ("node",),
     "param": ("param",),
@@ -55,11 +54,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "commission": ("commission",),
     "precompute": ("precompute",),
     "keys": ("keys",),
-    "systemd": ("systemd",),
     "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
-    "explain": ("explain",),
-    "files": ("files",),
-    "man": ("man",),
 }
 """The modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
@@ -94,18 +89,6 @@ In all other commands, Python's signal handler raises KeyboardInterrupt, and the
 """
 
 
-ROS_COMMANDS = {
-    "interface": "`flexsheet topic info TOPIC` prints the fields of a topic's messages",
-    "action": "flexsheet has topics only; see `flexsheet topic list`",
-    "component": "the launch file assigns nodes to processes; see docs/nodes-and-processes.md",
-    "pkg": "`flexsheet node types` lists the node types",
-    "rqt": "`flexsheet view` shows a running graph in Foxglove",
-    "rviz2": "`flexsheet view` shows a running graph in Foxglove",
-    "tf": "`flexsheet view` shows the transforms in Foxglove",
-}
-"""The commands of ROS 2 that flexsheet does not have, with the commands to use instead."""
-
-
 class CommandTable(Mapping[str, Any]):
     """A read-only table of commands by name; a command is imported when it is first used."""
 
@@ -130,11 +113,8 @@ class CommandGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that the arguments name.
 
-        Python's SIGINT handler is restored for commands that need it. Raises CommandError if the
-        command exists only in ROS 2.
+        Python's SIGINT handler is restored for commands that need it.
         """
-        if args and (instead := ROS_COMMANDS.get(args[0])):
-            raise CommandError(f'no command "{args[0]}"; {instead}', BAD_INPUT)
         found = super().resolve_command(ctx, args)
         if found[0] not in INTERRUPTED_AT_ONCE:
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -147,10 +127,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     # Subcommands inherit these settings.
-    context_settings={
-        "help_option_names": ["-h", "--help"],
-        "token_normalize_func": lambda name: FORMER_NAMES.get(name, name),
-    },
+    context_settings={"help_option_names": ["-h", "--help"]},
     epilog=examples("flexsheet try", "flexsheet launch demo", "flexsheet topic list"),
 )
 
@@ -184,31 +161,17 @@ def main() -> None:
         if code is None:
             raise
         words.print(f"flexsheet: {error_text(error)}")
-        if "--json" not in sys.argv and (more := explained_by(error)):
-            words.print(f"explanation: {more}", style="dim")
         sys.exit(code)
 
 
 def error_text(error: Exception) -> str:
-    """Return the text of an error.
+    """Return the text of an error with a remedy.
 
-    If it is an error of the operating system, the path and the remedy are added.
+    If it is an error of the operating system, the path is added.
     """
-    if not isinstance(error, OSError) or isinstance(error, FileWriteError):
-        return str(error)
-    return str(make_write_error(Path(error.filename or "standard output"), error))
-
-
-def explained_by(error: Exception) -> str | None:
-    """Return the command line that explains an error.
-
-    Returns None if the text of the error already contains the remedy.
-    """
-    if not isinstance(error, FlexsheetError) or isinstance(error, CommandError):
-        return None
-    if error.exit_code == BAD_INPUT or isinstance(error.__cause__, FileNotFoundError):
-        return None
-    return f"flexsheet explain {error.code}"
+    if isinstance(error, OSError) and not isinstance(error, FlexsheetError):
+        error = make_write_error(Path(error.filename or "standard output"), error)
+    return describe_error(error)
 
 
 def exit_code(error: Exception) -> int | None:

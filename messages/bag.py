@@ -62,7 +62,6 @@ _CHUNK_HEAD = struct.Struct("<QQQ")
 class BagError(FlexsheetError):
     """Raised if a bag cannot be written or read. The text names the file and the cause."""
 
-    code = "bag"
     remedy = (
         "`flexsheet bag info BAG` reports how much is readable. `flexsheet bag recover` writes the "
         "readable part to a complete bag."
@@ -72,9 +71,8 @@ class BagError(FlexsheetError):
 class NoBagError(BagError):
     """Raised if a bag does not exist."""
 
-    code = "no-bag"
+    remedy = ""
     exit_code = 2
-    remedy = "Check the path. Recordings are in the folder `runs`, unless a path was given."
 
 
 def join_frames(frames: Sequence[Any]) -> bytes:

@@ -119,7 +119,6 @@ MONITORED_EVENTS = zmq.EVENT_DISCONNECTED | sum(RECONNECTED) | sum(HANDSHAKE_FAI
 class BusError(FlexsheetError, RuntimeError):
     """Raised if a socket cannot be opened. The text names the topic and the endpoint."""
 
-    code = "bus"
     remedy = "Another graph has the endpoint. End that graph, or run `flexsheet doctor --sweep`."
 
 

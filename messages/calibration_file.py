@@ -28,19 +28,13 @@ MAX_CALIBRATION_DEPTH = 12
 class CalibrationFileError(FlexsheetError, ValueError):
     """Raised if a calibration file is invalid. The text names the file, the key and the remedy."""
 
-    code = "calibration-file"
     exit_code = 2
-    remedy = "Calibrate again, or use another calibration file."
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
     """Raised if a calibration was made for a camera, sheet or device that is not in the scene."""
 
-    code = "calibration-mismatch"
     exit_code = 2
-    remedy = (
-        "Use the calibration of the device in the scene, or a scene with the calibrated device."
-    )
 
 
 def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:

@@ -8,15 +8,11 @@ from typing import ClassVar
 class FlexsheetError(Exception):
     """The base class of errors that a user can correct.
 
-    code: name of the error for the command `flexsheet explain`.
-    remedy: text that states what the user can do.
-    phrase: text that every error of this class contains; "" if there is none.
+    remedy: sentence that states what the user can do; "" if the text of each error states it.
     exit_code: exit status of a command that ends with this error.
     """
 
-    code: ClassVar[str]
-    remedy: ClassVar[str]
-    phrase: ClassVar[str] = ""
+    remedy: ClassVar[str] = ""
     exit_code: int = 1
 
     def __str__(self) -> str:
@@ -25,3 +21,9 @@ class FlexsheetError(Exception):
         Without this method, an error that is also a KeyError would return the text in quotes.
         """
         return Exception.__str__(self)
+
+
+def describe_error(error: Exception) -> str:
+    """Return the text of an error and the remedy of its class, separated by a full stop."""
+    text, remedy = str(error), getattr(error, "remedy", "")
+    return f"{text.removesuffix('.')}. {remedy}" if remedy else text

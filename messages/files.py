@@ -20,9 +20,6 @@ class FileWriteError(FlexsheetError, OSError):
     and the free space.
     """
 
-    code = "file-write"
-    remedy = "Free space on the disk, create the folder, or give another file."
-
     def __str__(self) -> str:
         return str(self.strerror)
 

@@ -652,9 +652,7 @@ class Scene(Message):
 class UnfitGeometryError(FlexsheetError, ValueError):
     """Raised if a command or method does not work with the object's shape or support."""
 
-    code = "unfit-geometry"
     exit_code = 2
-    remedy = "Choose an object of a supported shape and support."
 
 
 def require_cylinder(scene: Scene) -> Cylinder:
@@ -674,7 +672,6 @@ def require_cylinder(scene: Scene) -> Cylinder:
 class MissingPartError(FlexsheetError, ValueError):
     """Raised if a scene does not contain a part that a node or command requires."""
 
-    code = "missing-part"
     remedy = "Add the part to the scene file, or leave out the node or command that needs it."
 
 

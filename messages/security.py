@@ -40,7 +40,6 @@ RefusalHandler = Callable[[str], None]
 class SecurityError(FlexsheetError, RuntimeError):
     """Raised if a key is invalid or missing. The text names the file or host, and the remedy."""
 
-    code = "keys"
     remedy = (
         "Run `flexsheet keys new HOST` on that host, and enter its public key in the launch file "
         "on every host."

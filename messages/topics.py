@@ -121,10 +121,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ROWS}
 class UnknownTopicError(FlexsheetError, KeyError):
     """Raised if a topic name is unknown. The text suggests a similar name."""
 
-    code = "unknown-topic"
     exit_code = 2
-    remedy = "`flexsheet topic list` prints all names."
-    phrase = "unknown topic"
 
 
 def find_topic(name: str) -> Topic:

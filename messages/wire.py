@@ -78,7 +78,6 @@ class WireError(FlexsheetError, ValueError):
         "writer", "plan", "replayed" and "forbidden".
     """
 
-    code = "wire"
     remedy = "Run the same version of flexsheet on all hosts. The topic `status` has the count."
 
     def __init__(self, cause: str, text: str) -> None:

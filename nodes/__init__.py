@@ -72,21 +72,12 @@ NODES: dict[str, str] = {
 class UnknownNodeError(FlexsheetError, KeyError):
     """Raised if a node type is not in `NODES`. The text suggests a similar type."""
 
-    code = "unknown-node"
-    remedy = "`flexsheet node types` prints all names."
-
 
 class NodeImportError(FlexsheetError, ImportError):
     """Raised if a node class "module:Class" cannot be imported.
 
     advice: text that states how to correct this error.
     """
-
-    code = "node-import"
-    remedy = (
-        "Write PYTHONPATH=FOLDER before the command, where FOLDER contains the module of the node, "
-        "or install its package. Commands that evaluate a graph or a bag need its nodes, too."
-    )
 
     def __init__(self, name: str, problem: str, advice: str) -> None:
         super().__init__(f'"{name}" cannot be imported: {problem}; {advice}')

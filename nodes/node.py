@@ -46,7 +46,7 @@ from pydantic import ConfigDict
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
-from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.errors import FlexsheetError, describe_error
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.notes import Note, NoteCode
 from flexsheet.messages.scene import Scene
@@ -544,7 +544,7 @@ class Node:
         The log has no traceback of a FlexsheetError, whose text states a remedy.
         """
         self.errors += 1
-        self.last_error = f"{what}: {type(error).__name__}: {error}"
+        self.last_error = f"{what}: {type(error).__name__}: {describe_error(error)}"
         trace = None if isinstance(error, FlexsheetError) else error
         self.log.error("handler failed", what=what, error=str(error), exc_info=trace)
 

@@ -23,7 +23,6 @@ import pytest
 
 from flexsheet import read_topic, running_graph
 from flexsheet.launch.commands import launching
-from flexsheet.launch.commands.scene import keys
 from flexsheet.launch.commands.session import describe_node, describe_output, explain_counts
 from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
@@ -245,6 +244,7 @@ def test_dry_run_prints_the_plan_and_starts_nothing(
     plan = flexsheet("launch", path, "--dry-run", "--json").json()
     assert plan["nodes"]["listener"]["inputs"][0]["topic"] == "twin/finger"
     printed = flexsheet("launch", path, "--dry-run", "--set", "beacon.rate_hz=12")
+    assert '  beacon -->|"twin/finger"| listener' in printed.out.splitlines()
     assert printed.code == 0
     assert "rate_hz=12.0" in printed.out
     assert "ipc://@run/beacon.twin.finger" in printed.out
@@ -589,18 +589,6 @@ def test_a_parameter_that_cannot_be_changed_is_explained(
     assert (result.code, printed in result.err) == (code, True), result.err
 
 
-def test_the_running_graph_is_printed_and_drawn(
-    flexsheet: Command, running: Path, tmp_path: Path
-) -> None:
-    assert "twin/finger -> listener" in flexsheet("graph").out
-    links = flexsheet("graph", "--json").json()["links"]
-    assert {"from": "beacon", "to": "listener", "topics": ["twin/finger"]} in links
-    for name in ("graph.svg", "graph.mmd"):
-        assert flexsheet("graph", "-o", tmp_path / name).code == 0
-        assert "twin/finger" in (tmp_path / name).read_text()
-    assert flexsheet("graph", "-o", tmp_path / "graph.gif").code == 2
-
-
 @pytest.mark.usefixtures("running")
 async def test_a_program_reads_a_graph_of_another_process() -> None:
     graph = running_graph()
@@ -919,16 +907,6 @@ def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
     assert [one["family"] for one in again] == ["marker"]
 
 
-def test_a_command_of_ros_2_names_its_replacement(flexsheet: Command) -> None:
-    printed = flexsheet("interface", "show", "Fingertip")
-    assert (printed.code, "topic info TOPIC" in printed.err) == (2, True)
-
-
-def test_the_keys_of_scene_files_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    keys(as_json=True)
-    groups = json.loads(capsys.readouterr().out)
-    (kind,) = (row for row in groups["support: base"] if row["key"] == "object.support.kind")
-    assert (kind["type"], kind["default"]) == ("base", "base")
-    keys(as_json=False)
-    printed = capsys.readouterr().out
-    assert all(row["key"] in printed for rows in groups.values() for row in rows)
+def test_the_schema_of_scene_files_is_printed(flexsheet: Command) -> None:
+    schema = flexsheet("scene", "schema").json()
+    assert {"object", "sheet", "tolerances"} <= schema["properties"].keys()

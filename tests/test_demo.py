@@ -108,7 +108,7 @@ def test_results_before_an_error_are_printed(
         assert "10 s" in out
         assert "0.062" in out
         assert "stroke.png" in err
-        assert "flexsheet explain overloaded" in err
+        assert OverloadedError.remedy in " ".join(err.split())
 
 
 def test_the_demo_ends_with_the_files_and_what_they_show(

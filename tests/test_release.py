@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from flexsheet.launch.commands.man import list_commands, render
 from tests.release import (
     PACKAGE_FOLDERS,
     ROOT,
@@ -31,7 +30,6 @@ PYTHONS = [
     for line in PROJECT["classifiers"]
     if (found := re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line))
 ]
-MANUAL_PAGE = "share/man/man1/flexsheet.1"
 CATEGORIES = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
 
 READ_ALL = """
@@ -43,20 +41,22 @@ from typer.testing import CliRunner
 
 import flexsheet
 from flexsheet.launch.cli import app
-from flexsheet.launch.commands.files import FileKind, list_files
 from flexsheet.launch.experiments.force_reference import REFERENCE_FILE
 from flexsheet.launch.plans.plan import load_graph, load_scene
-from flexsheet.launch.running.systemd import make_files
+from flexsheet.launch.plans.shipped import LAUNCH_FILES
 from flexsheet.messages.calibration import load_calibration
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.console.html_head import HERE
 from flexsheet.nodes.renderer.gl import shader_text
 
-paths = {kind: list_files(kind) for kind in FileKind}
+PATTERNS = {"launch": "*.yaml", "scene": "scenes/*", "calibration": "calibrations/*",
+            "layout": "viewing/*.json", "systemd": "systemd/*", "docker": "../docker/[!.]*"}
+paths = {kind: [one.resolve() for one in LAUNCH_FILES.glob(pattern) if one.is_file()]
+         for kind, pattern in PATTERNS.items()}
 for name in NODES:
     node_class(name)
 launched = {}
-for path in paths[FileKind.LAUNCH]:
+for path in paths["launch"]:
     done = CliRunner().invoke(app, ["launch", path.stem, "--dry-run", "--json"])
     assert done.exit_code == 0, done.output
     launched[path.stem] = sorted(json.loads(done.stdout)["nodes"])
@@ -64,14 +64,12 @@ print(json.dumps({
     "package": flexsheet.__file__,
     "files": {str(kind): [str(one) for one in found] for kind, found in paths.items()},
     "launched": launched,
-    "scenes": [load_scene(one).name for one in paths[FileKind.SCENE] if one.suffix == ".yaml"],
-    "calibrations": [load_calibration(one).device for one in paths[FileKind.CALIBRATION]],
+    "scenes": [load_scene(one).name for one in paths["scene"] if one.suffix == ".yaml"],
+    "calibrations": [load_calibration(one).device for one in paths["calibration"]],
     "shaders": [len(shader_text(one.name, CORRECTED=1, LENS=0, LOOK=0))
                 for one in Path(files("flexsheet.nodes.renderer")).glob("*.glsl")],
     "page": [len((HERE / name).read_text()) for name in ("page.css", "page.js")],
     "reference": len(json.loads(REFERENCE_FILE.read_text())),
-    "units": [one.text for one in make_files(launch_file=paths[FileKind.LAUNCH][0], host="main",
-                                             user="u", root=Path("/"))],
 }))
 """
 
@@ -81,9 +79,6 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the wheel from the source archive, as `make release` does."""
     folder = tmp_path_factory.mktemp("release")
     sources = link_sources(folder / "sources")
-    page = sources / MANUAL_PAGE
-    page.parent.mkdir(parents=True)
-    page.write_text(render())
     archive = build(sources, "build_sdist")
     with tarfile.open(archive) as packed:
         # Python 3.11.3 and older have no filters.
@@ -106,7 +101,6 @@ def test_the_wheel_contains_every_file_of_the_package(wheel: Path) -> None:
         pytest.skip("the tree is no git repository")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name.split("/")[0].split("-")[0] for name in names} == {"flexsheet"}
-    assert f"flexsheet-{VERSION}.data/data/{MANUAL_PAGE}" in names
     tracked = (f"flexsheet/{line}" for line in listed.stdout.split() if (ROOT / line).exists())
     assert sorted(set(tracked) - names) == []
 
@@ -166,19 +160,6 @@ def find_python(version: str) -> Path | None:
         if subprocess.run([one, "-c", check], capture_output=True, check=False).returncode == 0:
             return one
     return None
-
-
-def test_the_manual_page_describes_every_command(tmp_path: Path) -> None:
-    text = render()
-    for name, _ in list_commands():
-        assert f'.SS "flexsheet {name}'.replace("-", r"\-") in text
-    groff = shutil.which("groff")
-    if groff is None:
-        pytest.skip("groff is not installed")
-    done = subprocess.run(
-        [groff, "-man", "-Tutf8", "-ww", "-z"], input=text.encode(), capture_output=True, check=True
-    )
-    assert done.stderr == b""
 
 
 def test_versions_are_semantic_and_equal() -> None:

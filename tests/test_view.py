@@ -28,7 +28,7 @@ from google.protobuf.message_factory import GetMessageClass
 from typer.testing import CliRunner, Result
 
 from flexsheet.launch.cli import app
-from flexsheet.launch.commands.files import FileKind, list_files
+from flexsheet.launch.commands.view import LAYOUT
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.runs import Run, local_endpoints
@@ -462,11 +462,10 @@ def test_json_agrees_with_its_schema(message: Message) -> None:
 
 def test_the_layout_shows_channels_and_fields_that_exist() -> None:
     """Each panel of the shipped layout is placed once, and each path exists in the demo."""
-    (file,) = list_files(FileKind.LAYOUT)
-    layout = json.loads(file.read_text())
+    layout = json.loads(LAYOUT.read_text())
     plan = load_graph(Path("launch/demo.yaml"))
     channels = {one.name: one for one in list_channels([TOPICS[name] for name in plan.writers])}
-    text = file.read_text()
+    text = LAYOUT.read_text()
     keys = "value|topicPath|imageTopic|calibrationTopic|topicToRender"
     paths = re.findall(rf'"(?:{keys})": "([^"]+)"', text)
     assert len(paths) > 20

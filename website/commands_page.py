@@ -1,12 +1,14 @@
-"""Generate the reference of all commands, and the tables of their errors and notes."""
+"""Generate the reference of all commands, and the tables of notes of nodes."""
 
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterator
 from typing import Any
 
-from flexsheet.launch.commands.explain import entries
-from flexsheet.launch.commands.man import list_commands
+from typer.main import get_command
+
+from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import examples_in
 from flexsheet.messages.notes import (
     FINGERTIP_REASON_TEXTS,
@@ -24,6 +26,16 @@ def render() -> str:
         f"- [`flexsheet {name}`](#flexsheet-{name.replace(' ', '-')})" for name in by_name
     )
     return "\n".join([links + "\n", *(_section(name, one) for name, one in by_name.items())])
+
+
+def list_commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the full name and the object of all commands."""
+    for name, command in (group or get_command(app)).commands.items():
+        path = (*prefix, name)
+        if not hasattr(command, "commands") or command.invoke_without_command:
+            yield " ".join(path), command
+        if hasattr(command, "commands"):
+            yield from list_commands(command, path)
 
 
 def _section(name: str, command: Any) -> str:
@@ -60,14 +72,8 @@ def _description(parameter: Any) -> str:
 
 
 def render_errors() -> str:
-    """Return the tables of errors, notes, reasons and causes."""
-    full, short = ("code", "meaning", "what to do"), "what to do"
-    errors = [(f"`{one.code}`", one.meaning, one.remedy) for one in entries() if one.name]
-    notes = [
-        (f"`{one.code}`", f"`{one.phrase}`", one.meaning, one.remedy)
-        for one in entries()
-        if one.phrase and not one.name
-    ]
+    """Return the tables of reasons and causes."""
+    short = "what to do"
     reasons = [
         (f"`{reason}`", FINGERTIP_REASON_TEXTS[reason], remedy)
         for reason, remedy in FINGERTIP_REMEDIES.items()
@@ -78,10 +84,6 @@ def render_errors() -> str:
     ]
     return "\n".join(
         [
-            "## Errors of commands and nodes\n",
-            format_table(full, errors),
-            "## Notes of nodes\n",
-            format_table(("code", "text", "meaning", "what to do"), notes),
             "## Reasons of an invalid fingertip\n",
             format_table(("`reason`", "meaning", short), reasons),
             "## Causes that self-checks suspect\n",

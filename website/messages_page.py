@@ -13,6 +13,7 @@ from flexsheet.launch.ros2.inputs import INPUTS
 from flexsheet.launch.ros2.mapping import OWN_PREFIX, list_ros_topics
 from flexsheet.messages.base import Header
 from flexsheet.messages.field_types import describe_bounds, describe_field_type
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Topic
 
 
@@ -64,6 +65,11 @@ def render_types() -> str:
     sections = [type_section(kind) for kind in types]
     sections.append("## Parts\n\nGroups of fields within the types above.\n")
     return "\n".join([*sections, *(type_section(kind) for kind in parts)])
+
+
+def render_scene() -> str:
+    """Return a section for the type of scene files, then for each of its parts."""
+    return "\n".join(map(type_section, dict.fromkeys([Scene, *nested_models(Scene)])))
 
 
 def type_section(kind: type[BaseModel]) -> str:

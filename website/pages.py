@@ -18,7 +18,6 @@ from pathlib import Path
 
 from benchmarks import load, scenes, soft_body_size
 from flexsheet.launch.methods import charts
-from flexsheet.launch.plans.drawing import svg
 from website import (
     apparatus_figure,
     arms_page,
@@ -26,13 +25,11 @@ from website import (
     figures,
     messages_page,
     parameters_page,
-    scene_page,
     sensitivity_page,
     system_page,
     tolerances_page,
     tracking_page,
 )
-from website.graph import DRAWINGS
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -54,7 +51,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "registers": arms_page.render_registers,
     "ros2-inputs": messages_page.render_ros2_inputs,
     "ros2-topics": messages_page.render_ros2_topics,
-    "scene-keys": scene_page.render,
+    "scene-keys": messages_page.render_scene,
     "scenes": lambda: scenes.render(RESULTS / "scenes.json"),
     "sensitivity": lambda: sensitivity_page.render(RESULTS),
     "system": lambda: system_page.render_system(RESULTS),
@@ -74,9 +71,7 @@ def render_charts(folder: Path) -> str:
 
 def drawings() -> dict[Path, str]:
     """Return the drawings that the repository contains, by their path relative to docs/."""
-    drawn = {name: svg(picture) for name, picture in DRAWINGS.items()}
-    drawn["apparatus.svg"] = apparatus_figure.svg()
-    return {Path("images") / name: text for name, text in drawn.items()}
+    return {Path("images") / "apparatus.svg": apparatus_figure.svg()}
 
 
 def build(output: Path) -> None:

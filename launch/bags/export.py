@@ -84,7 +84,6 @@ It exceeds the size of the write buffer of the Foxglove library.
 class ExportError(FlexsheetError, RuntimeError):
     """Raised if a bag cannot be exported. The text gives the reason and the remedy."""
 
-    code = "export"
     remedy = "Install the package that the text names, or choose another output file."
 
 

@@ -83,9 +83,7 @@ to each joint angle (rad).
 class ArmPosesError(FlexsheetError, ValueError):
     """Raised if a folder of arm poses cannot be used for a calibration."""
 
-    code = "arm-poses"
     exit_code = 2
-    remedy = "Correct the row of joints.csv that the error names, or record that pose again."
 
 
 def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRig:

@@ -41,7 +41,6 @@ CONVERGED_COST_CHANGE = 1e-9
 class NotDeterminedError(FlexsheetError, ValueError):
     """Raised if the image pairs do not determine all parameters of the stereo rig."""
 
-    code = "not-determined"
     remedy = "Add image pairs that differ in tilt and distance."
 
 

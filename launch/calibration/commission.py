@@ -35,9 +35,6 @@ REPORT_FILE, APPARATUS_FILE, CROSSES_FILE = "report.md", "apparatus.yaml", "co-l
 class CommissionError(FlexsheetError, ValueError):
     """Raised if the commissioning in a folder cannot be continued or its data are invalid."""
 
-    code = "commission"
-    remedy = "Correct the option that the error names, or use a new folder."
-
 
 class StepName(StrEnum):
     """The steps of a commissioning (calibration of a whole laboratory), in their order.
@@ -166,7 +163,6 @@ class MissingDataError(CommissionError):
     The error text states how to capture the data.
     """
 
-    code = "commission-data"
     remedy = "Capture the data as the error says, and give the folder or file by --data STEP=PATH."
 
     def __init__(self, step: StepName, instruction: str) -> None:
@@ -177,7 +173,6 @@ class MissingDataError(CommissionError):
 class VerificationError(CommissionError):
     """Raised if a running graph fails during the finger stroke that verifies the calibration."""
 
-    code = "commission-verification"
     remedy = "Close other graphs, and run the same command again; finished steps are kept."
 
 

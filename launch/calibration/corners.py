@@ -64,12 +64,7 @@ REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 class CalibrationError(FlexsheetError, ValueError):
     """Raised if images cannot be used for a calibration."""
 
-    code = "calibration"
     exit_code = 2
-    remedy = (
-        "Capture sharp images of the whole board at different tilts. Check `--board` (inner "
-        "corners) and `--square-mm`."
-    )
 
 
 @dataclass(frozen=True, slots=True)

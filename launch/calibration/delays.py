@@ -76,7 +76,6 @@ This motion is used to measure the stamp offset (exposure time minus timestamp).
 class DelaysError(FlexsheetError, ValueError):
     """Raised if a recording does not contain the measured servo lag of an arm."""
 
-    code = "delays-calibration"
     remedy = "Record a stroke in which both arms follow the finger for several seconds."
 
 

@@ -53,7 +53,6 @@ A camera image has an intermediate brightness if the light changes during the ex
 class DisplayLatencyError(FlexsheetError, ValueError):
     """Raised if the latency of the projector cannot be estimated from the images."""
 
-    code = "display-latency-calibration"
     remedy = "Let the camera see the lit sheet, and record a stroke with --switches 60."
 
 

@@ -71,7 +71,6 @@ wrong arm, or to the wrong joint angles.
 class EdgeFitError(FlexsheetError, ValueError):
     """Raised if the marks do not determine the pose of the sheet's edge on an arm."""
 
-    code = "edge-fit"
     remedy = (
         "Measure three marks on each clamp in at least eight poses that differ in position, "
         "rotation and stretch of the sheet."

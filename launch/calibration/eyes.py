@@ -79,7 +79,6 @@ The viewer must use a chin rest during the measurement.
 class EyesError(FlexsheetError, ValueError):
     """Raised if the alignments do not determine the positions of the eyes."""
 
-    code = "eyes-calibration"
     remedy = (
         "Align at least six positions of the bead with each eye, spread over the sheet and at two "
         "distances from it, with the head on a rest."

@@ -41,7 +41,6 @@ window contains an edge or a fold of the sheet.
 class DecodeError(FlexsheetError, ValueError):
     """Raised if the patterns cannot be decoded from the camera images."""
 
-    code = "gray-code"
     remedy = "Capture all patterns in order, without over- or underexposure."
 
 

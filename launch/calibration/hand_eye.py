@@ -123,7 +123,6 @@ The result is an initial value for the fit of all unknowns.
 class HandEyeError(FlexsheetError, ValueError):
     """Raised if the measured poses do not determine the pose of the arm's base."""
 
-    code = "hand-eye"
     remedy = "Measure more poses, with the board rotated about at least two axes."
 
 

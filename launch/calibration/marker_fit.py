@@ -70,7 +70,6 @@ MAX_OFFSET_M = 0.05
 class MarkerFitError(FlexsheetError, ValueError):
     """Raised if the touches do not determine the marker's position on the finger."""
 
-    code = "marker-fit"
     remedy = "Touch known points in at least three orientations that differ by 15 degrees or more."
 
 

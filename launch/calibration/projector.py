@@ -52,9 +52,7 @@ The errors are of the rotation (rad), position (m), focal length (relative) and 
 class ProjectorError(FlexsheetError, ValueError):
     """Raised if images or points do not determine the intrinsics and pose of the projector."""
 
-    code = "projector-calibration"
     exit_code = 2
-    remedy = "Capture images in more poses, with the whole pattern on the sheet."
 
 
 @dataclass(frozen=True, slots=True)

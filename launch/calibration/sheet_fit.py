@@ -53,7 +53,6 @@ MAX_RELATIVE_DEVIATION = 0.5
 class SheetModelFitError(FlexsheetError, ValueError):
     """Raised if measured pushes do not determine the parameters of the sheet's force model."""
 
-    code = "sheet-model-fit"
     remedy = "Add pushes at other stretches and depths."
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import (
     NoGraphError,
     choose_run,
@@ -68,7 +68,6 @@ def record(
             metavar="TOPIC",
             help="Topic to record in addition to the default topics, such as stereo; repeat the "
             "option for several topics.",
-            autocompletion=complete.topics,
         ),
     ] = None,
     max_size_mb: Annotated[
@@ -323,7 +322,6 @@ def verify(
         str,
         typer.Argument(
             help="Name of a node of the graph that was recorded.",
-            autocompletion=complete.node_types,
         ),
     ],
     tolerance: Annotated[

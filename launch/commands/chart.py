@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.options import CYLINDER, JsonOption, make_app, output_file
 from flexsheet.launch.commands.output import (
     CommandError,
@@ -45,7 +44,6 @@ def chart(
         typer.Argument(
             help="Method family to measure; default: all families. The name system selects whole "
             "configurations of a graph instead.",
-            autocompletion=complete.families,
         ),
     ] = None,
     scene_files: Annotated[
@@ -55,7 +53,6 @@ def chart(
             metavar="SCENE",
             help="Scene to measure in; default: cylinder. For system, repeat the option for "
             "several scenes; the default is all shipped scenes.",
-            autocompletion=complete.scenes,
         ),
     ] = None,
     output: Annotated[Path, output_file("Folder for the charts and results.", "FOLDER")] = Path(

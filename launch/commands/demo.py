@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.experiment import (
     announce_recording,
     make_result_folder,
@@ -46,7 +46,6 @@ def demo(
             metavar="NAME_OR_FILE",
             help="Finger path to follow instead of the strokes: name of a gesture, or CSV file "
             "(columns t_s,x_mm,y_mm,z_mm).",
-            autocompletion=complete.gestures,
         ),
     ] = None,
     output: options.ResultFolderOption = None,

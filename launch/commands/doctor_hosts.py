@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.doctor import app
 from flexsheet.launch.commands.graph import running_graph
 from flexsheet.launch.commands.options import LAUNCH_FILE, JsonOption
@@ -50,7 +49,6 @@ def hosts(
         typer.Option(
             metavar="HOST",
             help="Name of this computer in the launch file; default: determined from its address.",
-            autocompletion=complete.hosts,
         ),
     ] = None,
     timeout: Annotated[

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
@@ -432,7 +432,6 @@ def gestures(
             metavar="NAME",
             help="Name of a gesture, or CSV file with a fingertip path; repeat the option "
             "for several gestures; default: all gestures.",
-            autocompletion=complete.gestures,
         ),
     ] = None,
     launch_file: options.LaunchOption = options.DEMO,

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.experiment import (
     StrokeOption,
     announce_recording,
@@ -233,7 +233,6 @@ def follow(
             metavar="NAME_OR_FILE",
             help="CSV file with a recorded fingertip path (columns t_s,x_mm,y_mm,z_mm), or the "
             "name of a gesture.",
-            autocompletion=complete.gestures,
         ),
     ],
     launch_file: options.LaunchOption = options.DEMO,

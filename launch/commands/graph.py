@@ -22,10 +22,6 @@ if TYPE_CHECKING:
 class NoGraphError(CommandError):
     """Raised if no graph is running on this computer."""
 
-    code = "no-graph"
-    remedy = "Start a graph with `flexsheet launch FILE`, or name the directory of its run (--run)."
-    phrase = "no graph is running"
-
     def __init__(self, text: str) -> None:
         super().__init__(text, FAILED)
 
@@ -33,13 +29,11 @@ class NoGraphError(CommandError):
 class SeveralGraphsError(CommandError):
     """Raised if several graphs are running, and a command does not state which one it changes."""
 
-    code = "several-graphs"
-    remedy = "Add --run with the run directory of the graph: `flexsheet stop --run FOLDER`."
-    phrase = "graphs are running, so --run is required"
-
     def __init__(self, runs: Sequence[Run]) -> None:
         choices = "".join(f"\n  --run {one.directory} ({describe_launch(one)})" for one in runs)
-        super().__init__(f"{len(runs)} {self.phrase}; choose one:{choices}", BAD_INPUT)
+        super().__init__(
+            f"{len(runs)} graphs are running, so --run is required; choose one:{choices}", BAD_INPUT
+        )
 
 
 def describe_launch(run: Run) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import find_node, list_readers
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -53,7 +53,6 @@ def launch(
         typer.Option(
             metavar="HOST",
             help="Start only the nodes of this host; default: the nodes of all hosts.",
-            autocompletion=complete.hosts,
         ),
     ] = None,
     dry_run: Annotated[
@@ -328,10 +327,12 @@ def _format_settings(node: ResolvedNode) -> str:
 
 
 def _print_plan(plan: ResolvedGraph, host: str | None, without: Collection[str]) -> None:
-    """Print the nodes and the topics of a graph.
+    """Print the nodes and the topics of a graph, and the graph as a Mermaid flowchart.
 
     without: names of nodes that are not listed, because the launcher does not start them.
     """
+    from flexsheet.launch.plans.drawing import mermaid
+
     words.print(f"plan {plan.hash} of {plan.launch_file}, scene {plan.scene_file or 'none'}")
     if plan.apparatus is not None:
         words.print(
@@ -368,3 +369,4 @@ def _print_plan(plan: ResolvedGraph, host: str | None, without: Collection[str])
             for writer in writers
         ],
     )
+    print(f"\n{mermaid(plan)}", end="")

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import NoGraphError, running_graph
 from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
@@ -49,7 +48,6 @@ def info(
         str,
         typer.Argument(
             help='Name of a node of the running graph, or a node type (name or "module:Class").',
-            autocompletion=complete.nodes,
         ),
     ],
     run: RunOption = None,

@@ -11,34 +11,11 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file
 
 DEMO, CYLINDER = Path("demo"), Path("cylinder")
 """The names of the default launch file and of the default scene of the commands."""
-
-FORMER_NAMES = {
-    "also": "include",
-    "into": "launch",
-    "names": "gesture",
-    "parameters": "parameter",
-    "patience": "timeout",
-    "seconds": "duration",
-    "full-length": "full",
-    "start-offset": "start",
-    "times": "count",
-    "topics": "topic",
-    "describe": "info",
-    "prepare": "precompute",
-    "ready": "enable",
-    "service": "systemd",
-    "stand-down": "disable",
-}
-"""The current name of each renamed option or command.
-
-The keys are the former names. They still work, but the help does not show them.
-"""
 
 
 def make_app(text: str | None = None) -> typer.Typer:
@@ -67,12 +44,10 @@ def find_scene(given: Path | None) -> Path | None:
 
 LAUNCH_FILE: dict[str, Any] = {
     "metavar": "LAUNCH_FILE",
-    "autocompletion": complete.launch_files,
     "callback": find_launch_file,
 }
 SCENE: dict[str, Any] = {
     "metavar": "SCENE",
-    "autocompletion": complete.scenes,
     "callback": find_scene,
 }
 """The settings that all arguments and options for a scene have in common.
@@ -131,7 +106,6 @@ def _run_option(default: str) -> Any:
         "--run",
         metavar="FOLDER",
         help=f"Run directory of the graph; {default}.",
-        autocompletion=complete.runs,
     )
 
 
@@ -157,7 +131,6 @@ TopicArgument = Annotated[
     typer.Argument(
         metavar="TOPIC",
         help="Name of the topic, such as twin/finger.",
-        autocompletion=complete.topics,
     ),
 ]
 TopicsOption = Annotated[
@@ -166,12 +139,9 @@ TopicsOption = Annotated[
         "--topic",
         metavar="TOPIC",
         help="Topic to include; repeat the option for several topics; default: all topics.",
-        autocompletion=complete.topics,
     ),
 ]
-BagArgument = Annotated[
-    Path, typer.Argument(metavar="BAG", help="Bag file.", autocompletion=complete.bags)
-]
+BagArgument = Annotated[Path, typer.Argument(metavar="BAG", help="Bag file.")]
 ResultFolderOption = Annotated[
     Path | None,
     typer.Option(

@@ -33,9 +33,6 @@ class CommandError(FlexsheetError):
     It ends the command with an error text and an exit code.
     """
 
-    code = "command"
-    remedy = "Correct the option or file that the error names."
-
     def __init__(self, text: str, exit_code: int = BAD_INPUT) -> None:
         super().__init__(text)
         self.exit_code = exit_code

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import (
     choose_run,
     find_node,
@@ -47,7 +46,6 @@ ParameterArgument = Annotated[
     typer.Argument(
         metavar="NODE.PARAM",
         help="Node and parameter, separated by a dot, such as planner.max_age_s.",
-        autocompletion=complete.node_parameters,
     ),
 ]
 
@@ -56,7 +54,7 @@ ParameterArgument = Annotated[
 def list_parameters(
     node: Annotated[
         str | None,
-        typer.Argument(help="Name of a node; default: all nodes.", autocompletion=complete.nodes),
+        typer.Argument(help="Name of a node; default: all nodes."),
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,

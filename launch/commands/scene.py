@@ -1,4 +1,4 @@
-"""`flexsheet scene`: list the keys of scene files, and export a scene to other tools."""
+"""`flexsheet scene`: print the schema of scene files, and export a scene to other tools."""
 
 from __future__ import annotations
 
@@ -12,40 +12,22 @@ from flexsheet.launch.commands.output import (
     CommandError,
     examples,
     print_json,
-    print_table,
     words,
 )
 
-app = make_app("List the keys of scene files, and export a scene to other tools.")
+app = make_app("Print the JSON Schema of scene files, and export a scene to other tools.")
 
 
 SUFFIXES = {".urdf": "urdf", ".xml": "urdf", ".gltf": "gltf", ".glb": "gltf"}
 """The format of an exported model for each suffix of the file name."""
 
 
-@app.callback()
-def scene() -> None:
-    """List the keys of scene files, and export a scene to other tools."""
+@app.command(epilog=examples("flexsheet scene schema"))
+def schema(as_json: JsonOption = False) -> None:
+    """Print the JSON Schema of scene files, with which editors complete and check keys."""
+    from flexsheet.messages.scene import Scene
 
-
-@app.command(epilog=examples("flexsheet scene keys", "flexsheet scene keys --json"))
-def keys(as_json: JsonOption = False) -> None:
-    """List all keys of scene files with type, unit, default and effect."""
-    from flexsheet.launch.objects.scene_keys import SceneKey, list_groups
-    from flexsheet.messages.field_types import strip_markdown
-
-    groups = {
-        group.title: [SceneKey(*map(strip_markdown, key)) for key in group.keys]
-        for group in list_groups()
-    }
-    if as_json:
-        print_json({title: [key._asdict() for key in rows] for title, rows in groups.items()})
-        return
-    for number, (title, rows) in enumerate(groups.items()):
-        if number:
-            print()
-        print(title)
-        print_table(SceneKey._fields, rows)
+    print_json(Scene.model_json_schema())
 
 
 @app.command(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete, options
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import (
     NoGraphError,
     SeveralGraphsError,
@@ -52,9 +52,7 @@ POLL_PERIOD_S = 0.05
 
 NodeArgument = Annotated[
     str,
-    typer.Argument(
-        metavar="NODE", help="Name of a node of the graph.", autocompletion=complete.nodes
-    ),
+    typer.Argument(metavar="NODE", help="Name of a node of the graph."),
 ]
 
 
@@ -257,7 +255,6 @@ def logs(
         typer.Argument(
             metavar="NODE",
             help="Name of a node of the graph; without it, the nodes are listed.",
-            autocompletion=complete.nodes,
         ),
     ] = None,
     lines: Annotated[

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, output_file
 from flexsheet.launch.commands.output import (
     NOT_GOOD,
@@ -42,7 +41,6 @@ def tune(
         typer.Option(
             metavar="NAME",
             help="Method family to tune; repeat the option for several families; default: all.",
-            autocompletion=complete.tuned_families,
         ),
     ] = None,
     output: Annotated[

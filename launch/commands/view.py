@@ -10,15 +10,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.files import FileKind, list_files
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.options import DurationOption, JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import CommandError, examples, print_json_line, words
+from flexsheet.launch.plans.shipped import LAUNCH_FILES
 
 if TYPE_CHECKING:
     from flexsheet.launch.viewing.live_server import LiveServer
 
 app = make_app()
+
+LAYOUT = LAUNCH_FILES / "viewing" / "foxglove-layout.json"
+"""The layout for Foxglove and Lichtblick."""
 
 NICENESS = 10
 """The niceness of the server, which gives the nodes of the graph a higher priority."""
@@ -86,12 +89,11 @@ async def _serve(
         ) from error
     try:
         address = f"ws://{ADDRESS}:{server.port}"
-        (layout,) = list_files(FileKind.LAYOUT)
         if as_json:
             names = [channel.name for channel in server.channels]
-            print_json_line({"address": address, "layout": str(layout), "channels": names})
+            print_json_line({"address": address, "layout": str(LAYOUT), "channels": names})
         words.print(f"connect Foxglove or Lichtblick to {address}")
-        words.print(f"layout: {layout}")
+        words.print(f"layout: {LAYOUT}")
         async with asyncio.timeout(duration_s):
             await server.serve()
     except TimeoutError:

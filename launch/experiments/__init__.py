@@ -18,17 +18,10 @@ Entry = TypeVar("Entry")
 class ExperimentError(FlexsheetError, RuntimeError):
     """Raised if an experiment fails or a bag does not contain the data of the experiment."""
 
-    code = "experiment"
-    remedy = (
-        "Correct what the text names. If your launch file may be the cause, compare with "
-        "`launch/demo.yaml`. A bag must be a recording of the same experiment."
-    )
-
 
 class OverloadedError(ExperimentError):
     """Raised if an experiment waits too long because the computer has too few free processors."""
 
-    code = "overloaded"
     remedy = (
         "End other programs until the row `load` of `flexsheet doctor` is ok, and start the "
         "experiment again. Its nodes may wait for a processor in at most a quarter of the time, "
@@ -39,14 +32,12 @@ class OverloadedError(ExperimentError):
 class ExperimentInterruptedError(ExperimentError):
     """Raised after a signal has interrupted an experiment and its nodes have been stopped."""
 
-    code = "experiment-interrupted"
     remedy = "Start the experiment again; a sweep continues with the trials that are missing."
 
 
 class ArmsNotReadyError(ExperimentError):
     """Raised if the arms do not follow the sheet target in time."""
 
-    code = "arms-not-ready"
     remedy = "The notes of the arm bridges name the limit or the node that holds the arms."
 
 

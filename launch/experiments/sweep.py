@@ -45,7 +45,6 @@ class TrialError(ExperimentError):
     It is raised in the parent process.
     """
 
-    code = "trial"
     remedy = "Run the same experiment alone; the text names what failed."
 
 

@@ -50,9 +50,7 @@ TITLE_WIDTH = 95
 class UnknownFamilyError(FlexsheetError, KeyError):
     """Raised if the user names a method family that does not exist."""
 
-    code = "unknown-family"
     exit_code = 2
-    remedy = "Use one of the names that the error lists (`flexsheet chart --help`)."
 
 
 def find_family(name: str) -> Family:

@@ -53,9 +53,6 @@ Setting = str | dict[str, Any]
 class UnknownTunableError(FlexsheetError, KeyError):
     """Raised if a method family does not exist, or cannot be tuned in the scene."""
 
-    code = "unknown-tunable"
-    remedy = "Use one of the names that the error lists (docs/tune.md)."
-
 
 @dataclass(frozen=True, slots=True)
 class Tunable:

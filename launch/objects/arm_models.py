@@ -35,7 +35,6 @@ This range protects the cables of the arm.
 class UrdfError(FlexsheetError, ValueError):
     """Raised if a URDF file does not describe a usable arm."""
 
-    code = "urdf"
     remedy = "Correct the URDF file or the links `base` and `tip` of the scene file."
 
 

@@ -31,7 +31,6 @@ More pixels would not improve the projected image, which has fewer pixels than t
 class TextureError(FlexsheetError, ValueError):
     """Raised if a file cannot be used as the texture of an object."""
 
-    code = "texture"
     remedy = "Use a PNG or JPEG file, and a mesh with texture coordinates."
 
 

@@ -134,11 +134,7 @@ class BadInputError(FlexsheetError, ValueError):
     The attribute `problems` lists all errors.
     """
 
-    code = "bad-input"
     exit_code = 2
-    remedy = (
-        "Open the file at the line in the text. Check it with `flexsheet launch FILE --dry-run`."
-    )
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         super().__init__("\n".join(str(problem) for problem in problems))

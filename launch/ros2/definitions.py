@@ -47,7 +47,6 @@ Make = Callable[..., Any]
 class Ros2Error(FlexsheetError, RuntimeError):
     """Raised if messages cannot be exchanged with ROS 2."""
 
-    code = "ros2"
     remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
 
 

@@ -29,9 +29,6 @@ REPORT_STEP_S = 20.0
 class NoSoftBodyError(FlexsheetError, RuntimeError):
     """Raised if the soft body (FEM model) of a scene cannot be computed."""
 
-    code = "no-soft-body"
-    remedy = "Follow the remedy in the text; see docs/soft-body-reference.md and docs/soft-body.md."
-
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
     """Compute the tables that the graph's planners and renderers need and that are not cached."""

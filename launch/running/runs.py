@@ -46,7 +46,6 @@ _count = itertools.count(1)
 class RunDirectoryError(FlexsheetError, RuntimeError):
     """Raised if the folder of all runs cannot be used."""
 
-    code = "run-directory"
     remedy = "Set `FLEXSHEET_RUNS` to a folder that belongs to you."
 
 

@@ -98,7 +98,6 @@ For log lines of the launcher, `node` is "launch".
 class NodeFailedError(FlexsheetError, RuntimeError):
     """Raised if a node fails more often than its restart policy allows."""
 
-    code = "node-failed"
     remedy = (
         "Read the node's log above this text, or in the folder `logs` of the run. The first error "
         "in it is the cause."

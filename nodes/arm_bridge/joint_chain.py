@@ -65,7 +65,6 @@ class UnreachableError(FlexsheetError, ValueError):
         solution.
     """
 
-    code = "unreachable"
     remedy = "Run `flexsheet doctor scene SCENE`, which lists the limits."
 
     def __init__(self, text: str, limit: str) -> None:

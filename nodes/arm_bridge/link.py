@@ -27,14 +27,12 @@ _COUNTER_PERIOD = 2**32
 class ArmLinkError(FlexsheetError):
     """The error raised if an exchange with an arm fails."""
 
-    code = "arm-link"
     remedy = "Check the arm's address, power, cable and program."
 
 
 class ArmSilentError(ArmLinkError):
     """The error raised if an arm does not accept a connection or does not answer in time."""
 
-    code = "arm-silent"
     remedy = (
         "First check whether the computer is overloaded (`flexsheet doctor`, row `load`), which is "
         "the usual cause with simulated arms. Then check the arm's address, power, cable and "
@@ -45,7 +43,6 @@ class ArmSilentError(ArmLinkError):
 class ArmRefusedError(ArmLinkError):
     """The error raised if an arm refuses a command."""
 
-    code = "arm-refused"
     remedy = (
         "Read the reason on the controller's teach pendant. The arm must be enabled, without alarm "
         "and in remote mode."
@@ -55,7 +52,6 @@ class ArmRefusedError(ArmLinkError):
 class ArmAnswerError(ArmLinkError):
     """The error raised if an answer is damaged, invalid or intended for another command."""
 
-    code = "arm-answer"
     remedy = (
         "Check that no other program controls the arm, and check the version of the arm's program."
     )

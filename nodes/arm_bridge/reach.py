@@ -287,7 +287,6 @@ class PathError(FlexsheetError, ValueError):
     fraction: position of the violation on the path, from 0 (start) to 1 (end).
     """
 
-    code = "path"
     remedy = "Move the arms nearer to the sheet by hand, then enable them again."
 
     def __init__(

@@ -22,7 +22,6 @@ Now = Callable[[], int]
 class DeviceError(FlexsheetError, RuntimeError):
     """Raised if a device or file cannot be read, or delivers images of a wrong size."""
 
-    code = "device"
     remedy = (
         "Check the cable, the device's name and the files in the launch file. Check that no other "
         "program uses the camera."

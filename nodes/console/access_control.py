@@ -31,7 +31,6 @@ The web site of an attacker could make its own name resolve to this computer (DN
 class ConsoleError(FlexsheetError, RuntimeError):
     """The error raised if the console cannot serve the page."""
 
-    code = "console"
     remedy = "Choose another port."
 
 

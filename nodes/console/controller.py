@@ -334,7 +334,6 @@ class ReleaseError(FlexsheetError, ValueError):
     The text names the hosts that are permitted to reset the e-stop.
     """
 
-    code = "release"
     remedy = (
         "Reset the e-stop on a host that the text names, or set `hosts.NAME.may_reset_estop` for "
         "this host in the launch file on all hosts."

@@ -23,7 +23,6 @@ MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 class SceneChoiceError(FlexsheetError, ValueError):
     """The error raised if a scene cannot be used."""
 
-    code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
 
 

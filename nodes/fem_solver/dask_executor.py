@@ -29,7 +29,6 @@ TRIES = 3
 class SchedulerError(precompute_table.WorkersError):
     """Raised if the workers of a dask scheduler cannot be used."""
 
-    code = "scheduler"
     remedy = "Check the scheduler's address, and that its workers run the same version."
 
     def __init__(self, address: str, what: str, remedy: str) -> None:

@@ -24,7 +24,6 @@ flatter elements, rounding errors make the solution useless."""
 class SolidMeshError(FlexsheetError, ValueError):
     """Raised if a mesh contains inverted or flat elements."""
 
-    code = "solid-mesh"
     remedy = "Increase skin_spacing_m; see docs/soft-body-reference.md."
 
 

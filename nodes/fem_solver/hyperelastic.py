@@ -35,7 +35,6 @@ NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
 class InvertedElementError(FlexsheetError, ArithmeticError):
     """Raised if a displacement inverts an element of the mesh."""
 
-    code = "inverted-element"
     remedy = "Use smaller load steps. Deep pushes may have no solution."
 
 

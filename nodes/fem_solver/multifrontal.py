@@ -27,7 +27,6 @@ NO_CHILDREN: tuple[int, ...] = ()
 class IndefiniteError(FlexsheetError, ArithmeticError):
     """Raised if a stiffness matrix is not positive definite."""
 
-    code = "indefinite"
     remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."
 
 

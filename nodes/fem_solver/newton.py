@@ -50,7 +50,6 @@ TOLERANCE = 1e-8
 class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
     """Raised if a load step of Newton's method does not converge."""
 
-    code = "newton"
     remedy = "Reduce the push, refine the mesh, or choose the linear method."
 
 

@@ -72,14 +72,10 @@ def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:
 class WorkersError(FlexsheetError, RuntimeError):
     """Raised if the workers that compute snapshots cannot be used."""
 
-    code = "workers"
-    remedy = "Follow the advice in the error text."
-
 
 class LostWorkersError(WorkersError):
     """Raised if the workers that compute snapshots are lost. Finished snapshots are stored."""
 
-    code = "lost-workers"
     remedy = "Start the workers again and repeat the command. Finished results are stored."
 
 

@@ -86,8 +86,6 @@ STRETCH_CANDIDATES = 17
 class UnfitCurveError(FlexsheetError, ValueError):
     """The error raised if a force curve is not finite, not ascending, or too short."""
 
-    code = "force-curve"
-    phrase = "force curve:"
     remedy = "Give forces at ascending depths, starting with force 0 N at depth 0 m."
 
 

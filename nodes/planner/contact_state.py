@@ -93,7 +93,6 @@ class ContactCommand:
 class UnpresentableError(FlexsheetError, ValueError):
     """The error raised if the sheet cannot render an object."""
 
-    code = "unpresentable"
     remedy = "Make the object larger or smoother, or the sheet wider."
 
 

@@ -43,7 +43,6 @@ MARK_RADIUS_M = 0.003
 class NoOpenGLError(FlexsheetError, RuntimeError):
     """Raised if no OpenGL 3.3 context can be created."""
 
-    code = "no-opengl"
     remedy = "Install the packages for EGL that `flexsheet doctor` names."
 
 

@@ -31,7 +31,6 @@ ON_A_PROJECTOR = {
 class WindowError(FlexsheetError, RuntimeError):
     """Raised if the requested window cannot be opened or was lost."""
 
-    code = "window"
     remedy = "Set `monitor` to a monitor that the error text lists, or set `output` to headless."
 
 

@@ -120,7 +120,6 @@ def _matrix(lens: Lens) -> Floats:
 class ImageMismatchError(FlexsheetError, ValueError):
     """Raised if images cannot come from the scene's camera."""
 
-    code = "image-mismatch"
     remedy = "Change the camera in the scene to the camera that took the images."
 
 

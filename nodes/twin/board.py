@@ -46,9 +46,7 @@ a ChArUco board must be visible."""
 class BoardError(FlexsheetError, ValueError):
     """Raised if a board cannot be rendered."""
 
-    code = "board"
     exit_code = 2
-    remedy = "Choose a board that fits into the images: fewer or smaller squares."
 
 
 @dataclass(frozen=True, slots=True)

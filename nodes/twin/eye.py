@@ -57,7 +57,6 @@ GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0,
 class NotMeasurableError(FlexsheetError, ValueError):
     """Raised if an image does not show the whole object that must be measured."""
 
-    code = "not-measurable"
     remedy = "Choose a pose in which the whole object is visible within the image."
 
 

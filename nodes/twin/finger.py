@@ -35,9 +35,7 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 class FingerPathError(FlexsheetError, ValueError):
     """Raised if the simulated finger cannot follow a path."""
 
-    code = "finger-path"
     exit_code = 2
-    remedy = "Slow the path down, or correct the point or line that the error text names."
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,6 @@ GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
 class NotConvergedError(FlexsheetError, RuntimeError):
     """Raised if the iteration for the membrane's equilibrium does not converge."""
 
-    code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
 
 

@@ -52,9 +52,6 @@ speed in one cycle."""
 class MxtError(FlexsheetError):
     """Raised if a command is invalid. The error ends the simulated controller's robot program."""
 
-    code = "mxt-program"
-    remedy = "No action is needed: the simulated controller's program restarts."
-
 
 class MxtController:
     """A simulated controller of one arm that answers one packet per cycle.

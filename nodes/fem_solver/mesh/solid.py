@@ -29,7 +29,6 @@ SAME_M = 1e-9
 class UnfitMeshError(FlexsheetError, ValueError):
     """Raised if an object cannot be meshed as specified."""
 
-    code = "unfit-mesh"
     remedy = "Choose a coarser or finer spacing, or repair the surface."
 
 

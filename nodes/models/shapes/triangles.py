@@ -29,7 +29,6 @@ MAX_DIHEDRAL_RAD = np.radians(175.0)
 class MeshError(FlexsheetError, ValueError):
     """Raised if a mesh is not the surface of a solid."""
 
-    code = "mesh"
     remedy = (
         "Repair the mesh: it must be closed, with outward triangles and without inverted elements; "
         "see docs/soft-body-reference.md."

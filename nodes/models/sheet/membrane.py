@@ -56,7 +56,6 @@ width are the thickness and the width of the sheet."""
 class NoEquilibriumError(FlexsheetError, ArithmeticError):
     """Raised if the iteration for the membrane's equilibrium does not converge."""
 
-    code = "no-equilibrium"
     remedy = "Reduce the push or the tilt: it is beyond the sheet's range."
 
 
