@@ -30,7 +30,8 @@ def render() -> str:
 
 def list_commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     """Yield the full name and the object of all commands."""
-    for name, command in (group or get_command(app)).commands.items():
+    commands: Any = get_command(app) if group is None else group
+    for name, command in commands.commands.items():
         path = (*prefix, name)
         if not hasattr(command, "commands") or command.invoke_without_command:
             yield " ".join(path), command

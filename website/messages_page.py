@@ -69,7 +69,8 @@ def render_types() -> str:
 
 def render_scene() -> str:
     """Return a section for the type of scene files, then for each of its parts."""
-    return "\n".join(map(type_section, dict.fromkeys([Scene, *nested_models(Scene)])))
+    kinds: list[type[BaseModel]] = [Scene, *nested_models(Scene)]
+    return "\n".join(type_section(kind) for kind in dict.fromkeys(kinds))
 
 
 def type_section(kind: type[BaseModel]) -> str:
