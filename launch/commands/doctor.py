@@ -50,31 +50,19 @@ def doctor(
     if context.invoked_subcommand is not None:
         return
     from flexsheet.launch.commands.doctor_hosts import check_running_graph, print_findings
-    from flexsheet.launch.health.doctor import check_all
+    from flexsheet.launch.health.doctor import check_computer
     from flexsheet.launch.running.runs import sweep as sweep_leftovers
 
     if sweep:
         ended = sweep_leftovers()
         words.print(f"ended {len(ended)} processes that crashed launchers had left running")
-    findings = []
-    with words.status("checking") as status:
-        for finding in check_all():
-            status.update(f"checked {finding.check}")
-            findings.append(finding)
-        status.update("checking all hosts")
-        host_findings = check_running_graph()
+    with words.status("checking"):
+        findings = [*check_computer(), *check_running_graph()]
     if as_json:
-        print_json([asdict(one) for one in findings] + [asdict(one) for one in host_findings])
+        print_json([asdict(one) for one in findings])
     else:
-        print_table(
-            ("check", "state", "finding", "remedy"),
-            [(one.check, one.state, one.what, one.remedy) for one in findings],
-        )
-        if host_findings:
-            print()
-            print_findings(host_findings)
-    states = {one.state for one in findings} | {one.state for one in host_findings}
-    if "failed" in states:
+        print_findings(findings)
+    if any(one.state == "failed" for one in findings):
         raise typer.Exit(FAILED)
 
 

@@ -22,7 +22,7 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from flexsheet.launch.health.doctor_hosts import HostFinding
+    from flexsheet.launch.health.doctor import Finding
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
 
@@ -79,7 +79,7 @@ def hosts(
         raise typer.Exit(FAILED)
 
 
-def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
+def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[Finding]:
     """Check the hosts of the running graph; return an empty list if no graph is running.
 
     If the graph runs on one host, only the results of the nodes' own calibration checks are
@@ -150,7 +150,7 @@ def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> st
 
 async def check_hosts(
     plan: ResolvedGraph, here: str, run: Run | None, timeout_s: float
-) -> list[HostFinding]:
+) -> list[Finding]:
     """Check this computer, and test the connections to all hosts of a graph; return all findings.
 
     here: host name of this computer.
@@ -183,13 +183,9 @@ async def check_hosts(
     return findings
 
 
-def print_findings(findings: list[HostFinding]) -> None:
-    """Print a table with one line per finding; each host name is printed only once."""
-    rows = []
-    before = ""
-    for one in findings:
-        rows.append(
-            (one.host if one.host != before else "", one.check, one.state, one.what, one.remedy)
-        )
-        before = one.host
-    print_table(("host", "check", "state", "finding", "remedy"), rows)
+def print_findings(findings: list[Finding]) -> None:
+    """Print a table with one line per finding."""
+    columns = ("host", "check", "state", "finding", "remedy")
+    print_table(
+        columns, [(one.host, one.check, one.state, one.what, one.remedy) for one in findings]
+    )

@@ -7,17 +7,20 @@ of a probe returns findings. Further findings come from checks of this computer.
 from __future__ import annotations
 
 import os
-import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Literal
 
 import psutil
 
-from flexsheet.launch.health.doctor import MIN_FREE_DISK_BYTES, check_libraries, check_opengl
+from flexsheet.launch.health.doctor import (
+    Finding,
+    State,
+    check_disk,
+    check_free_disk,
+    check_libraries,
+    check_opengl,
+)
 from flexsheet.launch.health.opengl import OPENGL_REMEDY
 from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.plans.hosts import is_loopback
@@ -31,7 +34,7 @@ from flexsheet.launch.running.host import (
 )
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
-from flexsheet.messages.busy import describe_busy, describe_busy_remedy, describe_pressure, is_busy
+from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.notes import SELF_CHECK_REMEDIES, describe_self_check
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 from flexsheet.messages.topics import TOPICS
@@ -39,7 +42,6 @@ from flexsheet.messages.types import HostStatus, PortStatus
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arm_bridge.link_drivers import TCP_DRIVERS
 
-State = Literal["ok", "warning", "failed", "not asked"]
 RATE_TOLERANCE_RATIO = 0.1
 """The relative tolerance of message rates, which are measured over one second."""
 
@@ -48,57 +50,24 @@ CONTROLLER_S = 2.0
 MAX_NAMES_SHOWN = 3
 
 
-@dataclass(frozen=True, slots=True)
-class HostFinding:
-    """The result of a check of a host.
-
-    what: text that describes the result.
-    remedy: text that states what the user can do; empty if the check passed.
-    """
-
-    host: str
-    check: str
-    state: State
-    what: str
-    remedy: str = ""
-
-
-NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
-    Reachability.NO_ROUTE: (
-        "this computer has no route to {address}",
-        "check the network of this computer (ip address) and its cable",
-    ),
+FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.UNREACHABLE: (
-        "no computer has the address {address}",
-        "check that {host} is on and connected, and that its address is {address} (ip address)",
+        "reachable",
+        "{address} cannot be reached: {problem}",
+        "check that {host} is on, its cable, that its address is {address} (ip address), and that "
+        "its firewall opens the TCP ports {first}-{last} for the other hosts",
     ),
-    Reachability.NO_REPLY: (
-        "no reply from {address}",
-        "check that {host} is on, that its address is {address}, and its firewall",
-    ),
-    Reachability.BLOCKED: (
-        "{address} is on, but its firewall blocks the ports of flexsheet",
-        "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
-    ),
-}
-"""The texts of the finding and the remedy for each reason why a host cannot be reached."""
-
-LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.CLOSED: (
         "launcher",
         "the host is on, but no launcher runs there",
         "on {host}: flexsheet launch {file} --host {host}; under systemd: journalctl -u "
         "flexsheet@{host}; if it runs, compare the addresses in the launch files",
     ),
-    Reachability.HANDSHAKE_TIMEOUT: (
+    Reachability.SILENT: (
         "launcher",
-        "the host accepts connections, but does not complete the handshake",
-        "the launcher hangs, or another program uses its ports; on {host}: flexsheet doctor",
-    ),
-    Reachability.NO_RESPONSE: (
-        "launcher",
-        "the keys match, but no valid message arrived",
-        "the launcher hangs or runs another version; see the refused messages",
+        "the host accepts connections, but no valid message arrived",
+        "the launcher hangs or runs another version, or another program uses its ports; on "
+        "{host}: flexsheet doctor",
     ),
     Reachability.KEY_MISMATCH: (
         "keys",
@@ -107,13 +76,8 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.KEY_REJECTED: (
         "keys",
-        "the host rejects the key of {here}: its launch file has no key or another key for {here}",
+        "the host rejects the key of {here}, or does not encrypt its messages",
         "copy {file} from here to {host}, and start its launcher again",
-    ),
-    Reachability.UNENCRYPTED: (
-        "keys",
-        "the host does not encrypt its messages, or another program uses its ports",
-        "copy {file} from here to {host} and restart the launcher there",
     ),
     Reachability.OWN_KEY_INVALID: (
         "keys",
@@ -121,10 +85,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
         "correct the key of this computer first; see the findings of {here}",
     ),
 }
-"""The name of the check, the finding and the remedy for hosts whose launcher does not respond.
-
-The keys are the reasons why a launcher does not respond although its host is on.
-"""
+"""The check, the finding and the remedy for hosts that do not report, by what was found out."""
 
 SAME_COMMIT_REMEDY = "use the same commit on all hosts: git pull, make setup, and start again"
 SELF_CHECK = "self-check"
@@ -133,8 +94,8 @@ SELF_CHECK = "self-check"
 
 def evaluate_probes(
     plan: ResolvedGraph, here: str, probes: Mapping[str, HostProbe]
-) -> list[HostFinding]:
-    found: list[HostFinding] = []
+) -> list[Finding]:
+    found: list[Finding] = []
     own = probes[here].status
     reference = (
         (python_version(), software(), "") if own is None else (own.python, own.software, own.code)
@@ -153,97 +114,64 @@ def evaluate_probes(
         found.append(_check_software(probe, reference))
         if len(plan.hosts) > 1:
             found.append(_check_clocks(plan, probe, probes))
-        found.append(_check_nodes(plan, probe))
+        found.append(_check_nodes(probe))
         found.append(_check_rates(plan, probe))
         found += _check_devices(plan.nodes_on(host), probe)
-        found += check_apparatus(probe, plan.nodes_on(host))
-        found += _check_resources(probe)
+        found += check_apparatus(probe)
+        found += [check_free_disk(probe.status.disk_free_bytes, host), _check_memory(probe.status)]
     return found
 
 
-REQUIRED_FOR_CHECKS = {
-    "reference_marks_world_m": "the pose of the camera",
-    "touch_point_world_m": "the marker on the finger",
-    "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
-}
-"""The quantities that optional self-checks test.
-
-Each key is the node parameter that enables the self-check.
-"""
-
-
-def check_apparatus(probe: HostProbe, nodes: Sequence[ResolvedNode]) -> Iterator[HostFinding]:
-    """Yield the results of the nodes' self-checks, which detect errors of the calibration.
-
-    Each suspected error is a finding. If no error is suspected, the finding lists the self-checks
-    that are disabled.
-
-    nodes: nodes of the host in the launch file.
-    """
+def check_apparatus(probe: HostProbe) -> Iterator[Finding]:
+    """Yield each calibration error that the self-checks of the nodes suspect."""
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
     for one in suspected:
         what, remedy = describe_self_check(one), SELF_CHECK_REMEDIES[one.cause]
-        yield HostFinding(probe.host, SELF_CHECK, "warning", what, remedy)
-    missing = [
-        f"{subject}: set `{parameter}` of {node.name}"
-        for node in nodes
-        for parameter, subject in REQUIRED_FOR_CHECKS.items()
-        if parameter in node.parameters and not node.parameters[parameter]
-    ]
-    if not suspected and (checks or missing):
-        unchecked = (f"no check of {one}" for one in missing)
-        text = "; ".join([f"{len(checks)} residuals as expected", *unchecked])
-        yield HostFinding(probe.host, SELF_CHECK, "ok", text)
+        yield Finding(probe.host, SELF_CHECK, "warning", what, remedy)
+    if checks and not suspected:
+        yield Finding(probe.host, SELF_CHECK, "ok", f"{len(checks)} residuals as expected")
 
 
 def _check_reachability(
     plan: ResolvedGraph, here: str, probe: HostProbe, *, running: bool
-) -> Iterator[HostFinding]:
+) -> Iterator[Finding]:
     host, address = probe.host, plan.hosts[probe.host]
-    fields = {
-        "host": host,
-        "here": here,
-        "address": address,
-        "file": plan.launch_file,
-        "first": FIRST_PORT,
-        "last": FIRST_PORT + PORT_COUNT - 1,
-    }
-    if probe.reachability in NETWORK_FAULTS:
-        what, remedy = NETWORK_FAULTS[probe.reachability]
-        problem = what.format(**fields)
-        yield HostFinding(host, "reachable", "failed", problem, remedy.format(**fields))
-        yield HostFinding(host, "other checks", "not asked", "the host cannot be reached")
-        return
-    what = f"{address}, {'this computer' if host == here else 'by TCP'}"
-    yield HostFinding(host, "reachable", "ok", what)
     if probe.status is not None:
-        up = f"up for {probe.status.uptime_s:.0f} s, run {probe.status.run}"
-        yield HostFinding(host, "launcher", "ok", up)
+        up = f"up for {probe.status.uptime_s:.0f} s at {address}, run {probe.status.run}"
+        yield Finding(host, "launcher", "ok", up)
     elif probe.reachability == Reachability.LOCAL:
         remedy = f"flexsheet launch {plan.launch_file} --host {host}"
         fault: State = "failed" if running else "warning"
-        yield HostFinding(host, "launcher", fault, "no graph runs here", remedy)
+        yield Finding(host, "launcher", fault, "no graph runs here", remedy)
     else:
-        check, what, remedy = LAUNCHER_FAULTS[probe.reachability]
+        check, what, remedy = FAULTS[probe.reachability]
+        fields = {
+            "host": host,
+            "here": here,
+            "address": address,
+            "problem": probe.problem,
+            "file": plan.launch_file,
+            "first": FIRST_PORT,
+            "last": FIRST_PORT + PORT_COUNT - 1,
+        }
         # A closed port is not a fault before any graph is started.
-        state: State = (
-            "warning" if probe.reachability == Reachability.CLOSED and not running else "failed"
-        )
-        yield HostFinding(host, check, state, what.format(**fields), remedy.format(**fields))
-        yield HostFinding(host, "other checks", "not asked", "the host's launcher does not report")
+        closed = probe.reachability == Reachability.CLOSED and not running
+        state: State = "warning" if closed else "failed"
+        yield Finding(host, check, state, what.format(**fields), remedy.format(**fields))
+        yield Finding(host, "other checks", "not asked", "the host does not report")
     for text in probe.failed_handshakes[:MAX_NAMES_SHOWN]:
         # The first handshake of this probe succeeded, so the keys are correct.
         remedy = "the host is very busy or the network is slow; run this check again"
-        yield HostFinding(host, "keys", "warning", text, remedy)
+        yield Finding(host, "keys", "warning", text, remedy)
     for text in probe.refused[:MAX_NAMES_SHOWN]:
-        yield HostFinding(host, "messages", "failed", text, SAME_COMMIT_REMEDY)
+        yield Finding(host, "messages", "failed", text, SAME_COMMIT_REMEDY)
 
 
-def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[HostFinding]:
+def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Finding]:
     assert probe.status is not None
     if probe.status.plan_hash == plan.hash:
-        yield HostFinding(probe.host, "plan", "ok", plan.hash)
+        yield Finding(probe.host, "plan", "ok", plan.hash)
     else:
         remedy = "use the same launch file, scene and --set on all hosts, then start again"
         if probe.host == here:
@@ -255,14 +183,14 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Ho
             f"the host runs plan {probe.status.plan_hash}, but {plan.launch_file} resolves to plan "
             f"{plan.hash}"
         )
-        yield HostFinding(probe.host, "plan", "failed", what, remedy)
+        yield Finding(probe.host, "plan", "failed", what, remedy)
     if probe.status.estop is not None:
         what = f"an e-stop is engaged: {probe.status.estop}"
         remedy = "when it is safe, run on a host that may reset it: flexsheet arms reset"
-        yield HostFinding(probe.host, "e-stop", "warning", what, remedy)
+        yield Finding(probe.host, "e-stop", "warning", what, remedy)
 
 
-def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
+def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> Finding:
     assert probe.status is not None
     theirs = {one.host: one.key for one in probe.status.keys}
     names = sorted(theirs.keys() | plan.keys.keys())
@@ -270,39 +198,30 @@ def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     if other:
         what = f"the host's keys differ from this launch file for {', '.join(other)}"
         remedy = f"copy {plan.launch_file} to {probe.host}, and start its launcher again"
-        return HostFinding(probe.host, "keys", "failed", what, remedy)
+        return Finding(probe.host, "keys", "failed", what, remedy)
     what = f"the host accepts the same keys as this computer: {', '.join(names)}"
-    return HostFinding(probe.host, "keys", "ok", what)
+    return Finding(probe.host, "keys", "ok", what)
 
 
-def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFinding:
+def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> Finding:
     status = probe.status
     assert status is not None
-    python, versions, code = reference
     what = f"python {status.python}, {status.software}, commit {status.code}"
-    other = [
-        name
-        for name, theirs, ours in (
-            ("python", status.python, python),
-            ("libraries", status.software, versions),
-            ("commit", status.code, code or status.code),
-        )
-        if theirs != ours
-    ]
-    if other:
-        what += f"; different from this computer: {', '.join(other)}"
-        return HostFinding(probe.host, "software", "warning", what, SAME_COMMIT_REMEDY)
-    return HostFinding(probe.host, "software", "ok", what)
+    # Without a graph on this computer, its commit is unknown.
+    if reference != (status.python, status.software, reference[2] and status.code):
+        what += "; different from this computer"
+        return Finding(probe.host, "software", "warning", what, SAME_COMMIT_REMEDY)
+    return Finding(probe.host, "software", "ok", what)
 
 
 def _check_clocks(
     plan: ResolvedGraph, probe: HostProbe, probes: Mapping[str, HostProbe]
-) -> HostFinding:
+) -> Finding:
     """Check that the clock offsets from a host to the other hosts are known accurately enough.
 
     The clock node of the host states the maximum uncertainty that is allowed.
     """
-    finding = partial(HostFinding, probe.host, "clocks")
+    finding = partial(Finding, probe.host, "clocks")
     if probe.clocks is None:
         what = "the clock node of the host does not publish"
         return finding("failed", what, "see the log of the clock node")
@@ -333,27 +252,27 @@ def _check_clocks(
     return finding("ok", what)
 
 
-def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
+def _check_nodes(probe: HostProbe) -> Finding:
     assert probe.status is not None
     nodes = probe.status.nodes
-    ended = [one.name for one in nodes if one.state == "exited"]
-    starting = [one.name for one in nodes if one.state == "starting"]
-    restarted = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
     remedy = f"see {probe.status.run}/logs in the folder of runs on {probe.host}"
-    finding = partial(HostFinding, probe.host, "nodes")
-    if ended:
-        return finding("failed", f"these nodes have ended: {', '.join(ended)}", remedy)
+    exited = [one.name for one in nodes if one.state == "exited"]
+    if exited:
+        what = f"these nodes have ended: {', '.join(exited)}"
+        return Finding(probe.host, "nodes", "failed", what, remedy)
+    starting = [one.name for one in nodes if one.state == "starting"]
     if starting:
-        what = f"these nodes are still starting: {', '.join(starting)}"
-        return finding("warning", what, f"wait some seconds; otherwise {remedy}")
+        what = f"these nodes are starting: {', '.join(starting)}"
+        return Finding(probe.host, "nodes", "warning", what, remedy)
+    restarted = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
     if restarted:
         what = f"{len(nodes)} nodes are ready; restarts: {', '.join(restarted)}"
-        return finding("warning", what, remedy)
-    return finding("ok", f"{len(nodes)} nodes are ready")
+        return Finding(probe.host, "nodes", "warning", what, remedy)
+    return Finding(probe.host, "nodes", "ok", f"{len(nodes)} nodes are ready")
 
 
-def _check_rates(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
-    odd, right, refused = [], 0, []
+def _check_rates(plan: ResolvedGraph, probe: HostProbe) -> Finding:
+    odd = []
     # Nodes report the ports that their scene does not need, too; these have no endpoints.
     unconnected = {
         (node.name, port.topic)
@@ -368,22 +287,16 @@ def _check_rates(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
             if (name, port.topic) in unconnected:
                 continue
             if port.rejected:
-                refused.append(f"{name} {port.rejected} of {port.topic}")
-            wrong = find_rate_problem(port)
-            topic = TOPICS.get(port.topic)  # another version may have other topics
-            if wrong:
+                odd.append(f"{name} refused {port.rejected} of {port.topic}")
+            if wrong := find_rate_problem(port):
                 odd.append(f"{name} {verb} {wrong}")
-            elif topic is not None and topic.rate_hz is not None:
-                right += 1
-    if odd or refused:
-        texts = _shorten(odd)
-        if refused:
-            texts.append(f"refused: {', '.join(_shorten(refused))}")
+    if odd:
+        texts = odd[:MAX_NAMES_SHOWN]
+        if len(odd) > len(texts):
+            texts.append(f"and {len(odd) - len(texts)} more")
         remedy = "start with the first node upstream; see its status and log"
-        return HostFinding(probe.host, "rates", "warning", "; ".join(texts), remedy)
-    if not right:
-        return HostFinding(probe.host, "rates", "not asked", "its nodes report no rates yet")
-    return HostFinding(probe.host, "rates", "ok", f"{right} ports at the rate of their topic")
+        return Finding(probe.host, "rates", "warning", "; ".join(texts), remedy)
+    return Finding(probe.host, "rates", "ok", "all ports at the rate of their topic")
 
 
 def find_rate_problem(port: PortStatus) -> str | None:
@@ -416,18 +329,16 @@ The check tests whether the node publishes messages.
 """
 
 
-def _report_devices(
-    host: str, devices: Sequence[str], missing: Sequence[str]
-) -> Iterator[HostFinding]:
+def _report_devices(host: str, devices: Sequence[str], missing: Sequence[str]) -> Iterator[Finding]:
     if missing:
         what = f"these device files do not exist: {', '.join(missing)}"
         remedy = "check the cable and the device number: v4l2-ctl --list-devices"
-        yield HostFinding(host, "devices", "failed", what, remedy)
+        yield Finding(host, "devices", "failed", what, remedy)
     elif devices:
-        yield HostFinding(host, "devices", "ok", ", ".join(devices))
+        yield Finding(host, "devices", "ok", ", ".join(devices))
 
 
-def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
+def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[Finding]:
     assert probe.status is not None
     host, missing = probe.host, probe.status.missing_devices
     devices = list_device_files(nodes)
@@ -439,86 +350,50 @@ def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[
         status = probe.nodes.get(node.name)
         if status is None:
             what = f"{node.name} does not report"
-            yield HostFinding(host, check, "failed", what, "see the node's log")
+            yield Finding(host, check, "failed", what, "see the node's log")
             continue
         sent = max((one.rate_hz for one in status.outputs if one.topic != "status"), default=0.0)
         what = f"{sent:.0f} Hz; {status.note_text or 'no note'}"
         if sent > 0.0:
-            yield HostFinding(host, check, "ok", what)
+            yield Finding(host, check, "ok", what)
         else:
-            yield HostFinding(host, check, "failed", what, remedy)
+            yield Finding(host, check, "failed", what, remedy)
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
             yield _check_arm(node, probe)
 
 
-def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
+def _check_arm(node: ResolvedNode, probe: HostProbe) -> Finding:
     arm = probe.arms.get(str(node.arm_side))
     check = f"arm {node.arm_side}"
+    where = "" if node.device_address is None else f" at {node.device_address}"
     if arm is None:
-        return _check_silent_arm(node, probe, check)
+        status = probe.nodes.get(node.name)
+        what = f"{node.name} does not report" if status is None else status.note_text
+        remedy = f"check that the controller{where} is on and its program runs; see the node's log"
+        return Finding(probe.host, check, "failed", what, remedy)
     what = ", ".join(filter(None, (arm.mode, arm.reason, "; ".join(arm.faults))))
     if arm.mode == "disconnected":
-        where = "" if node.device_address is None else f" at {node.device_address}"
         remedy = f"check that the controller{where} is on and its program runs: docs/modbus.md"
-        return HostFinding(probe.host, check, "failed", what, remedy)
+        return Finding(probe.host, check, "failed", what, remedy)
     if arm.faults:
         remedy = "when the cause is fixed: flexsheet arms reset"
-        return HostFinding(probe.host, check, "warning", what, remedy)
-    if arm.ready:
-        next_step = "ready"
-    elif arm.auto_arming:
-        next_step = "moves when no interlock is active"
-    else:
-        next_step = "to let it move: flexsheet arms enable"
-    return HostFinding(probe.host, check, "ok", f"{what}; {next_step}")
+        return Finding(probe.host, check, "warning", what, remedy)
+    return Finding(probe.host, check, "ok", what)
 
 
-def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostFinding:
-    status = probe.nodes.get(node.name)
-    if status is None:
-        what = f"{node.name} does not report"
-        return HostFinding(probe.host, check, "failed", what, "see the node's log")
-    assert probe.status is not None
-    starts = any(one.state == "starting" for one in probe.status.nodes)
-    where = "" if node.device_address is None else f" at {node.device_address}"
-    remedy = f"check that the controller{where} is on and its program runs; see the node's log"
-    state: Literal["warning", "failed"] = "warning" if starts else "failed"
-    return HostFinding(probe.host, check, state, status.note_text, remedy)
-
-
-def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
-    status = probe.status
-    assert status is not None
-    yield _check_disk(probe.host, status.disk_free_bytes)
-    finding = partial(HostFinding, probe.host, "memory")
+def _check_memory(status: HostStatus) -> Finding:
     what = f"{status.memory_free_bytes / 2**30:.1f} GiB free"
     if status.memory_free_bytes < MIN_FREE_MEMORY_BYTES:
-        yield finding("warning", what, "find the largest programs on that host: top")
-    else:
-        yield finding("ok", what)
+        remedy = "find the largest programs on that host: top"
+        return Finding(status.host, "memory", "warning", what, remedy)
+    return Finding(status.host, "memory", "ok", what)
 
 
-def _check_load(status: HostStatus) -> HostFinding:
+def _check_load(status: HostStatus) -> Finding:
     if is_busy(status):
-        remedy = describe_busy_remedy(nice_denied=status.nice_denied)
-        return HostFinding(status.host, "load", "warning", describe_busy(status), remedy)
-    what = f"load {status.load_ratio:.2f} per core"
-    if status.cpu is not None:
-        what += f"; {describe_pressure(status.cpu)}"
-    return HostFinding(status.host, "load", "ok", what)
-
-
-def _check_disk(host: str, free_bytes: int) -> HostFinding:
-    what = f"{free_bytes / 2**30:.1f} GiB free"
-    if free_bytes < MIN_FREE_DISK_BYTES:
-        return HostFinding(host, "disk", "warning", what, "free some disk space for bags")
-    return HostFinding(host, "disk", "ok", what)
-
-
-def _shorten(texts: Sequence[str]) -> list[str]:
-    more = len(texts) - MAX_NAMES_SHOWN
-    return [*texts[:MAX_NAMES_SHOWN], *([f"and {more} more"] if more > 0 else [])]
+        return Finding(status.host, "load", "warning", describe_busy(status), BUSY_REMEDY)
+    return Finding(status.host, "load", "ok", f"load {status.load_ratio:.2f} per core")
 
 
 def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
@@ -545,40 +420,36 @@ def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
 
 def check_before_start(
     plan: ResolvedGraph, here: str, key_problem: str | None
-) -> Iterator[HostFinding]:
+) -> Iterator[Finding]:
     address, nodes, own = plan.hosts[here], plan.nodes_on(here), list_own_addresses()
     if is_loopback(address) or address in own:
-        yield HostFinding(here, "address", "ok", f"{address} is an address of this computer")
+        yield Finding(here, "address", "ok", f"{address} is an address of this computer")
     else:
         what = f"{address} is not an address of this computer, which has {', '.join(sorted(own))}"
         remedy = "name the right host with --host, or correct the launch file on all hosts"
-        yield HostFinding(here, "address", "failed", what, remedy)
+        yield Finding(here, "address", "failed", what, remedy)
     if key_problem is not None:
         remedy = f"flexsheet keys install {plan.launch_file} {here}, then copy it to all hosts"
-        yield HostFinding(here, "keys", "failed", key_problem, remedy)
+        yield Finding(here, "keys", "failed", key_problem, remedy)
     elif plan.keys:
         what = f"{secret_file(here)} matches the launch file; only its owner can read it"
-        yield HostFinding(here, "keys", "ok", what)
+        yield Finding(here, "keys", "ok", what)
     elif not all(map(is_loopback, plan.hosts.values())):
         remedy = "run flexsheet keys new on each host, then flexsheet keys install: docs/deploy.md"
-        yield HostFinding(here, "keys", "failed", "the launch file has no keys", remedy)
-    libraries = check_libraries()
-    what = f"python {python_version()}, {software()}; {libraries.what}"
-    yield HostFinding(here, "software", libraries.state, what, libraries.remedy)
+        yield Finding(here, "keys", "failed", "the launch file has no keys", remedy)
+    yield check_libraries(here)
     yield _check_ports(plan, here)
     devices = list_device_files(nodes)
     yield from _report_devices(here, devices, [one for one in devices if not os.path.exists(one)])
     if any(node.role is NodeRole.RENDERER for node in nodes):
-        opengl = check_opengl()
-        yield HostFinding(here, opengl.check, opengl.state, opengl.what, opengl.remedy)
+        yield check_opengl(here)
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
             yield _check_controller(here, node)
-    folder = find_recording_folder(nodes)
-    yield _check_disk(here, shutil.disk_usage(folder if folder.is_dir() else Path.cwd()).free)
+    yield check_disk(find_recording_folder(nodes), here)
 
 
-def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
+def _check_ports(plan: ResolvedGraph, here: str) -> Finding:
     address = plan.hosts[here]
     ports = [
         int(writer.tcp.rpartition(":")[2])
@@ -592,16 +463,16 @@ def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
     if used:
         remedy = "find the program with ss -ltnp; another user may run a graph"
         what = f"these ports are in use: {', '.join(map(str, sorted(used)))}"
-        return HostFinding(here, "ports", "failed", what, remedy)
-    return HostFinding(here, "ports", "ok", f"{len(ports)} ports are free")
+        return Finding(here, "ports", "failed", what, remedy)
+    return Finding(here, "ports", "ok", f"{len(ports)} ports are free")
 
 
-def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
+def _check_controller(here: str, node: ResolvedNode) -> Finding:
     """Check that the controller of an arm accepts connections.
 
     This function must be called only if no graph is running.
     """
-    finding = partial(HostFinding, here, f"arm {node.arm_side}")
+    finding = partial(Finding, here, f"arm {node.arm_side}")
     if node.device_address is None:
         return finding("not asked", f"{node.name} uses its own driver")
     address, _, port = node.device_address.rpartition(":")

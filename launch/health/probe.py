@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -43,11 +44,6 @@ Nodes publish their message rates once per second.
 """
 
 POLL_PERIOD_S = 0.02
-SSH_PORT = 22
-"""The port that is tried to find out whether a host is on.
-
-An accepted or a refused connection to this port shows that the host is on.
-"""
 
 
 class Reachability(StrEnum):
@@ -56,21 +52,15 @@ class Reachability(StrEnum):
     RESPONDING = "responding"
     LOCAL = "local"
     """The host is this computer, and no graph is running on it."""
-    NO_ROUTE = "no_route"
     UNREACHABLE = "unreachable"
-    """No host has the address in the launch file."""
-    NO_REPLY = "no_reply"
-    BLOCKED = "blocked"
-    """The host is on, but a firewall drops packets to the port."""
     CLOSED = "closed"
-    HANDSHAKE_TIMEOUT = "handshake_timeout"
+    """The host is on, but no program listens at the port."""
     KEY_MISMATCH = "key_mismatch"
     """The key of the host differs from the host's key in the launch file of this computer."""
     KEY_REJECTED = "key_rejected"
-    """The host rejects the key of this computer."""
-    UNENCRYPTED = "unencrypted"
-    NO_RESPONSE = "no_response"
-    """The host completed the handshake, but no status message of the host arrived."""
+    """The host rejects the key of this computer, or does not encrypt."""
+    SILENT = "silent"
+    """The host accepts connections, but no status message of the host arrived."""
     OWN_KEY_INVALID = "own_key_invalid"
     """The host is on, but this computer has no usable key with which it could connect."""
 
@@ -78,7 +68,7 @@ class Reachability(StrEnum):
 HANDSHAKES: dict[int, Reachability] = {
     zmq.EVENT_HANDSHAKE_SUCCEEDED: Reachability.RESPONDING,
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: Reachability.KEY_REJECTED,
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: Reachability.UNENCRYPTED,
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: Reachability.KEY_REJECTED,
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: Reachability.KEY_MISMATCH,
 }
 
@@ -87,12 +77,14 @@ HANDSHAKES: dict[int, Reachability] = {
 class HostProbe:
     """The messages that were received from one host, and the problems that occurred meanwhile.
 
+    problem: reason of the system why the host cannot be reached.
     refused: reasons why messages were rejected.
     failed_handshakes: texts about connections that failed after an earlier successful connection.
     """
 
     host: str
     reachability: Reachability
+    problem: str = ""
     status: HostStatus | None = None
     clock_id: str = ""
     nodes: dict[str, Status] = field(default_factory=dict)
@@ -145,9 +137,10 @@ async def _probe_remote(
     assert writer is not None
     assert writer.tcp is not None
     address, port = plan.hosts[host], int(writer.tcp.rpartition(":")[2])
-    reachability = await probe_port(address, port)
-    if reachability is not Reachability.RESPONDING:
-        return HostProbe(host, reachability)
+    if number := await connect(address, port):
+        closed = number == errno.ECONNREFUSED
+        reachability = Reachability.CLOSED if closed else Reachability.UNREACHABLE
+        return HostProbe(host, reachability, problem=os.strerror(number))
     if keys is None and (plan.keys or not is_loopback(address)):
         return HostProbe(host, Reachability.OWN_KEY_INVALID)
     probe = HostProbe(host, await _try_handshake(writer.tcp, host, keys))
@@ -156,24 +149,7 @@ async def _probe_remote(
     return probe
 
 
-async def probe_port(address: str, port: int) -> Reachability:
-    """Try to connect to a TCP port, and return why the connection failed.
-
-    Return RESPONDING if the connection succeeded.
-    """
-    number = await _connect(address, port)
-    if number == 0:
-        return Reachability.RESPONDING
-    if number == errno.ECONNREFUSED:
-        return Reachability.CLOSED
-    if number == errno.ENETUNREACH:
-        return Reachability.NO_ROUTE
-    if await _connect(address, SSH_PORT) in (0, errno.ECONNREFUSED):
-        return Reachability.BLOCKED
-    return Reachability.UNREACHABLE if number == errno.EHOSTUNREACH else Reachability.NO_REPLY
-
-
-async def _connect(address: str, port: int) -> int:
+async def connect(address: str, port: int) -> int:
     """Connect to a TCP port; return 0, or the error number if the connection fails."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -206,7 +182,7 @@ async def _try_handshake(endpoint: str, host: str, keys: KeyRing | None) -> Reac
         opened.disable_monitor()
         monitor.close(linger=0)
         opened.close(linger=0)
-    return Reachability.HANDSHAKE_TIMEOUT
+    return Reachability.SILENT
 
 
 async def _listen(
@@ -218,7 +194,7 @@ async def _listen(
 ) -> None:
     """Read messages of a host until all expected messages have arrived or `timeout_s` has passed.
 
-    If no status message of the host arrives, the reachability of the probe becomes NO_RESPONSE.
+    If no status message of the host arrives, the reachability of the probe becomes SILENT.
 
     find_source: function that returns the endpoint at which a given publisher can be read.
     timeout_s: maximum time for which messages are read.
@@ -270,7 +246,7 @@ async def _listen(
         for subscriber in subscribers:
             subscriber.close()
     if probe.status is None:
-        probe.reachability = Reachability.NO_RESPONSE
+        probe.reachability = Reachability.SILENT
 
 
 def _is_complete(plan: ResolvedGraph, probe: HostProbe) -> bool:
