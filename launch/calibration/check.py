@@ -1,7 +1,7 @@
 """Evaluate a stereo calibration by measuring a board of known size.
 
 Errors are underestimated on image pairs that were used to calibrate. Therefore, `check_stereo`
-requires other pairs, and `cross_check` measures each pair with a calibration that does not use it.
+names such pairs.
 """
 
 from __future__ import annotations
@@ -13,27 +13,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flexsheet.launch.calibration.bundle import (
-    LEFT,
-    RIGHT,
-    STAND,
-    lens_arrays,
-    pose_transform,
-    to_floats,
-)
+from flexsheet.launch.calibration.bundle import LEFT, RIGHT, STAND, lens_arrays, pose_transform
 from flexsheet.launch.calibration.corners import (
     BoardPair,
-    BoardView,
     CalibrationError,
     Progress,
-    align_numbering,
     board_points,
     compute_digest,
     find_pairs,
     ignore_progress,
-    read_gray,
 )
-from flexsheet.launch.calibration.selection import MIN_PAIRS, PairSelection, fit_selection
 from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.camera import camera_matrix
@@ -223,130 +212,4 @@ def check_stereo(
     return {
         **summarize([measure_board(rig, pair, board) for pair in pairs]),
         "used_to_calibrate": reused,
-    }
-
-
-def calibrate_plain_opencv(
-    pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
-) -> StereoRig:
-    """Calibrate a stereo camera in the same way as OpenCV's tutorials, for comparison.
-
-    The lens parameters are fitted first, and then only the transform between the cameras.
-
-    points: corners of the board (n, 3), m.
-    size: width and height of the images, px.
-    """
-    model = [points[pair.left.ids].astype(np.float32) for pair in pairs]
-    left = [pair.left.pixels.astype(np.float32) for pair in pairs]
-    right = [pair.right.pixels.astype(np.float32) for pair in pairs]
-    _, left_matrix, left_distortion, *_ = cv2.calibrateCamera(model, left, size, None, None)
-    _, right_matrix, right_distortion, *_ = cv2.calibrateCamera(model, right, size, None, None)
-    *_, rotation, position, _, _ = cv2.stereoCalibrate(
-        model,
-        left,
-        right,
-        left_matrix,
-        left_distortion,
-        right_matrix,
-        right_distortion,
-        size,
-        flags=cv2.CALIB_FIX_INTRINSIC,
-    )
-    return StereoRig(
-        (to_floats(left_matrix), to_floats(right_matrix)),
-        (to_floats(left_distortion).ravel()[:5], to_floats(right_distortion).ravel()[:5]),
-        np.block([[rotation, position], [np.zeros((1, 3)), np.ones((1, 1))]]),
-    )
-
-
-PLAIN_HALF_WINDOW_PX = 5
-
-
-def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
-    """Find chessboard corners in the same way as OpenCV's tutorials, for comparison.
-
-    The corners are refined in a fixed window of 11x11 px. Return None if one of the images does not
-    show the board.
-    """
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
-    window = (PLAIN_HALF_WINDOW_PX, PLAIN_HALF_WINDOW_PX)
-    views = []
-    for path in (left, right):
-        image = read_gray(path)
-        found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows))
-        if not found:
-            return None
-        refined = cv2.cornerSubPix(image, corners.copy(), window, (-1, -1), criteria)
-        views.append(refined.reshape(-1, 2).astype(np.float64))
-    ids = np.arange(board.columns * board.rows)
-    return BoardPair(
-        BoardView(ids, views[0]), BoardView(ids, align_numbering(views[0], views[1], board))
-    )
-
-
-def cross_check(
-    left_paths: Sequence[Path],
-    right_paths: Sequence[Path],
-    *,
-    board: Board,
-    leave_out: int = 1,
-    progress: Progress = ignore_progress,
-) -> dict[str, object]:
-    """Cross-validate a stereo calibration with images of a calibration board.
-
-    The image pairs are divided into groups. For each group, the camera is calibrated with all other
-    pairs. The board is then measured in the pairs of the group. Consecutive pairs are in different
-    groups, because their images are similar. If the board is a chessboard, the calibration method
-    of OpenCV's tutorials is evaluated in the same way, for comparison.
-
-    leave_out: number of pairs in each group.
-
-    Raises CalibrationError if images cannot be used, or if too few pairs remain.
-    """
-    found, size = find_pairs(left_paths, right_paths, board, progress)
-    whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}
-    if len(whole) - leave_out < MIN_PAIRS or leave_out < 1:
-        raise CalibrationError(
-            f"{len(whole)} of {len(found)} pairs are usable, and {leave_out} are left out at a "
-            f"time, but at least {MIN_PAIRS} must remain to calibrate; capture more images"
-        )
-    points = board_points(board)
-    plain: dict[int, BoardPair] = {}
-    if board.kind == "chessboard":
-        for i in whole:
-            pair = find_plain_corners(left_paths[i], right_paths[i], board)
-            if pair is not None:
-                plain[i] = pair
-    numbers = list(whole)
-    groups = -(-len(numbers) // leave_out)
-    measured: dict[int, BoardMeasurement] = {}
-    plain_measured: dict[int, BoardMeasurement] = {}
-    for group in range(groups):
-        out = numbers[group::groups]
-        rest = [i for i in numbers if i not in out]
-        selection = PairSelection([whole[i] for i in rest], [left_paths[i].name for i in rest])
-        rig = StereoRig.from_fit(fit_selection(selection, points, size).rig)
-        measured.update({i: measure_board(rig, whole[i], board) for i in out})
-        if plain:
-            plain_rig = calibrate_plain_opencv([plain[i] for i in rest if i in plain], points, size)
-            plain_measured |= {
-                i: measure_board(plain_rig, plain[i], board) for i in out if i in plain
-            }
-        progress(group + 1, groups, "cross-validating")
-    return {
-        **summarize(list(measured.values())),
-        "calibrate_plain_opencv": (
-            summarize(list(plain_measured.values())) if plain_measured else None
-        ),
-        "rows": [
-            {
-                "left": left_paths[i].name,
-                "distance_m": measured[i].distance_m,
-                "rigid_fit_rms_mm": _rms_mm(measured[i].rigid_fit_m),
-                "plain_rigid_fit_rms_mm": (
-                    _rms_mm(plain_measured[i].rigid_fit_m) if i in plain_measured else None
-                ),
-            }
-            for i in numbers
-        ],
     }

@@ -23,7 +23,6 @@ from flexsheet.launch.commands.output import (
     print_fields,
     print_json,
     print_result,
-    print_table,
     progress_bar,
     words,
 )
@@ -247,60 +246,6 @@ def check(
 
 
 @app.command(
-    "cross-check",
-    epilog=examples(
-        "flexsheet calibrate cross-check --left 'left*.jpg' --right 'right*.jpg' --board 9x6 "
-        "--square-mm 25"
-    ),
-)
-def cross_check(
-    *,
-    left: LeftOption,
-    right: RightOption,
-    board: BoardOption,
-    square_mm: SquareOption,
-    marker_mm: MarkerOption = None,
-    dictionary: DictionaryOption = FOUR_BITS,
-    leave_out: Annotated[
-        int, typer.Option(help="Number of image pairs that each calibration omits.", min=1)
-    ] = 1,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Cross-validate the calibration of a stereo camera with images of a board.
-
-    The command calibrates repeatedly. Each time, it omits some of the image pairs, and then
-    measures the board in the omitted pairs. It also prints the errors of a calibration that uses
-    only OpenCV's functions.
-    """
-    from flexsheet.launch.calibration import check
-
-    with progress_bar("cross-validating") as progress:
-        result = check.cross_check(
-            _find_images("--left", left),
-            _find_images("--right", right),
-            board=parse_board(board, square_mm, marker_mm, dictionary),
-            leave_out=leave_out,
-            progress=progress,
-        )
-    if as_json:
-        print_json(result)
-        return
-    rows: Any = result.pop("rows")
-    plain: Any = result.pop("calibrate_plain_opencv")
-    print_table(
-        ("pair", "distance, m", "rigid fit, mm", "plain OpenCV, mm"),
-        [[row["left"], *(_format(value) for value in list(row.values())[1:])] for row in rows],
-    )
-    print_table(
-        ("all excluded pairs", "flexsheet", "plain OpenCV"),
-        [
-            (name, _format(value), _format(None if plain is None else plain[name]))
-            for name, value in result.items()
-        ],
-    )
-
-
-@app.command(
     "board",
     epilog=examples(
         "flexsheet calibrate board --board 9x6 --square-mm 25 -o board.svg",
@@ -328,10 +273,6 @@ def print_board(
         print_json({"file": str(output), "board": described.model_dump(mode="json")})
     else:
         print_fields([("file", output), ("board", make_caption(described))])
-
-
-def _format(value: object) -> str:
-    return "-" if value is None else f"{value:.4f}" if isinstance(value, float) else str(value)
 
 
 def _check_single_source(
