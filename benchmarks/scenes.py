@@ -25,7 +25,7 @@ import psutil
 from ruamel.yaml import YAML
 
 from flexsheet.launch.experiments.driver import Driver
-from flexsheet.launch.experiments.gestures import gesture_path
+from flexsheet.launch.experiments.finger_paths import gesture_path
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import DEMO_FILE, require_scene
 from flexsheet.launch.experiments.system_run import read_cpu_s

@@ -47,7 +47,7 @@ from scipy.stats import theilslopes
 from flexsheet.launch.commands.output import print_rows
 from flexsheet.launch.experiments import image
 from flexsheet.launch.experiments.driver import Driver
-from flexsheet.launch.experiments.gestures import gesture_path
+from flexsheet.launch.experiments.finger_paths import gesture_path
 from flexsheet.launch.experiments.run import DEMO_FILE, new_folder
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.plan import load_graph

@@ -13,11 +13,6 @@ from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
 from flexsheet.launch.experiments.driver import Driver
-from flexsheet.launch.experiments.hand_gestures import (
-    HAND_GESTURES,
-    compute_felt_force,
-    evaluate_touch,
-)
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import run_experiment
 from flexsheet.launch.experiments.simulated_time import (
@@ -33,7 +28,6 @@ from flexsheet.launch.experiments.simulated_time import (
     make_soft_body,
     touch_in_simulated_time,
 )
-from flexsheet.launch.experiments.stroke import object_pose
 from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
@@ -44,15 +38,13 @@ from flexsheet.messages.types import (
     ArmLatency,
     FingerPath,
     Fingertip,
-    Phase,
     SheetTarget,
     SoftBody,
     TwinArms,
     TwinFinger,
 )
 from flexsheet.nodes.models.motion import SheetMotion
-from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
-from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.planner import hand_bounds
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
@@ -60,7 +52,6 @@ from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.twin import finger_node
-from flexsheet.nodes.twin.finger import join_points
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from flexsheet.nodes.twin.hand import (
     CoupledFinger,
@@ -70,7 +61,6 @@ from flexsheet.nodes.twin.hand import (
     TrueSheet,
 )
 from flexsheet.nodes.twin.membrane import TrueRubber, solve
-from flexsheet.nodes.twin.paths import inside as inside_volume
 from flexsheet.nodes.twin.sheet_reaction import (
     POSITION_FRACTIONS,
     SheetReaction,
@@ -232,51 +222,6 @@ def test_the_table_of_the_sheet_is_the_membranes_force(tmp_path: Path) -> None:
             )
             found = np.interp(depth, reaction.depths_m, curve)
             assert found == pytest.approx(float(pushed.finger_force_n[2]), rel=0.08)
-
-
-def make_recording(forces_n: Floats, positions_m: Floats, phases: list[Phase]) -> TouchRecording:
-    """Return a run of a millisecond per sample, in which the finger is where it is felt."""
-    times = SETTLING_S + 0.001 * np.arange(len(forces_n))
-    steps = np.column_stack([times, np.zeros(len(times)), forces_n])
-    return TouchRecording(times, positions_m, phases, steps, 0, 0.04)
-
-
-def test_chatter_is_what_a_gesture_does_not_consist_of() -> None:
-    # The finger is 5 mm deep, where the object's force is 0.2 N, and rebounds once.
-    forces = np.repeat([0.0, 0.2, 0.0, 0.25, 0.2, 0.0], 200)
-    positions = np.tile([0.0, 0.0, -0.005], (len(forces), 1))
-    phases: list[Phase] = ["contact"] * len(forces)
-    recorded = make_recording(forces, positions, phases)
-    felt = compute_felt_force(SCENE, recorded, CURVE)
-    np.testing.assert_allclose(felt.wanted_n, 0.2, rtol=1e-6)
-    result = evaluate_touch(recorded, felt, touches=1)
-    assert (result["touches"], result["chatter"], result["phase_changes"]) == (2, 1, 0)
-    assert result["transient_n"] == pytest.approx(0.05)
-    assert result["peak_error_n"] == pytest.approx(0.2)
-    assert result["mean_error_n"] == pytest.approx((3 * 0.2 + 0.05) / 6)
-
-
-def test_beside_the_end_of_the_object_no_force_is_wanted() -> None:
-    positions = np.tile([0.05, 0.0, -0.005], (4, 1))
-    positions[2:, 0] = 0.07
-    felt = compute_felt_force(SCENE, make_recording(np.zeros(4), positions, ["contact"] * 4), CURVE)
-    np.testing.assert_allclose(felt.wanted_n, [0.2, 0.2, 0.0, 0.0], rtol=1e-6)
-
-
-@pytest.mark.parametrize("name", HAND_GESTURES)
-def test_a_gesture_touches_as_often_as_it_says_and_ends_in_the_air(name: str) -> None:
-    make_path, touches = HAND_GESTURES[name]
-    path = make_path(SCENE, 0.01)
-    motion = join_points(path.times_s, path.positions_world_m, path.joined_by)
-    times = np.linspace(0.0, path.times_s[-1], 2000)
-    points = np.array([motion.at(at)[0] for at in times])
-    shape = make_shape(dict(SCENE.object.geometry))
-    heights = shape.closest(apply(inverse(object_pose(SCENE)), points)).height_m
-    inside = heights < -1e-4
-    assert np.count_nonzero(inside[1:] & ~inside[:-1]) == touches
-    assert heights[-1] > 0.005
-    assert inside_volume(SCENE, points, 0.0)
-    assert motion.speeds().max() <= SCENE.finger.max_speed_m_per_s
 
 
 def make_push(depth_m: float, seconds: float) -> FingerPath:

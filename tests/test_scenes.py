@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.organ import obj_text, organ_mesh
 from flexsheet.launch.experiments import ExperimentError
-from flexsheet.launch.experiments.gestures import gesture_path
+from flexsheet.launch.experiments.finger_paths import gesture_path
 from flexsheet.launch.health.layout import check_layout
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene

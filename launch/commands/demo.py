@@ -56,7 +56,7 @@ def demo(
     The result of each experiment is printed and saved when the experiment is finished.
     """
     from flexsheet.launch.experiments.demo import DemoResult, run_demo
-    from flexsheet.launch.experiments.gestures import finger_path as load_path
+    from flexsheet.launch.experiments.finger_paths import finger_path as load_path
 
     given = options.with_scene(settings, scene)
     path = None

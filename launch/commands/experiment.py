@@ -22,10 +22,7 @@ from flexsheet.launch.plans.features import Feature
 from flexsheet.messages.units import format_percent
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from flexsheet.launch.experiments.driver import TableMethod
-    from flexsheet.launch.experiments.hand_gestures import FeltForce
     from flexsheet.launch.experiments.image import Series
     from flexsheet.messages.types import FingerPath
 
@@ -422,65 +419,6 @@ def _measure_images(
         words.print(f"map: {map_file}")
 
 
-@app.command(epilog=examples("flexsheet experiment gestures --gesture tap --gesture stop"))
-def gestures(
-    *,
-    names: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--gesture",
-            metavar="NAME",
-            help="Name of a gesture, or CSV file with a fingertip path; repeat the option "
-            "for several gestures; default: all gestures.",
-        ),
-    ] = None,
-    launch_file: options.LaunchOption = options.DEMO,
-    scene: options.OtherSceneOption = None,
-    settings: options.SettingsOption = None,
-    apparatus: options.ApparatusOption = None,
-    output: options.ResultFolderOption = None,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Measure the accuracy of fingertip tracking during simulated human gestures.
-
-    The gestures are strokes, taps, reaches, stops and turns.
-    """
-    from flexsheet.launch.experiments import gestures as experiment
-    from flexsheet.launch.experiments import select_names
-    from flexsheet.launch.experiments.run import run_experiment
-
-    selected = select_names(options.split_names(names), experiment.GESTURES, "gesture")
-    bag = make_result_folder(output, "gestures") / "gestures.mcap"
-    with progress_words() as progress:
-        procedure = experiment.make_gestures_procedure(selected, progress)
-        given = options.with_scene(settings, scene)
-        run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
-        result = experiment.gestures_result(bag, selected)
-    if as_json:
-        print_json(result)
-    else:
-        _print_gestures(result["gestures"])
-        print_followed([one["followed"] for one in result["gestures"] if one["followed"]])
-        words.print(f"bag: {bag}")
-
-
-def _print_gestures(results: list[dict[str, Any]]) -> None:
-    """Print a table of tracking errors (mm) and delays (ms), with one line per gesture."""
-    columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
-    for each in results[0]["prediction"][1:]:
-        columns += [f"+{each['horizon_ms']:.0f} ms rms", "lag, ms"]
-    rows = []
-    for result in results:
-        now, *ahead = result["prediction"]
-        row = [result["gesture"], _show_ratio(result["valid_ratio"]), str(result["missing"])]
-        row += [shown(result["error_mm"][key], ".3f") for key in ("rms", "p99", "max")]
-        row += [shown(result["jump"]["max_sigmas"], ".1f"), shown(now["lag_ms"], ".1f")]
-        for each in ahead:
-            row += [shown(each["rms"], ".3f"), shown(each["lag_ms"], ".1f")]
-        rows.append(row)
-    print_table(columns, rows)
-
-
 def _show_ratio(ratio: float | None) -> str:
     return "-" if ratio is None else format_percent(ratio)
 
@@ -511,7 +449,7 @@ def announce_recording(finger_path: str, path: FingerPath) -> None:
 
     finger_path: value of the option --finger-path.
     """
-    from flexsheet.launch.experiments.gestures import GESTURES
+    from flexsheet.launch.experiments.finger_paths import GESTURES
 
     if finger_path not in GESTURES:
         words.print(
@@ -570,7 +508,6 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
     epilog=examples(
         "flexsheet experiment stability",
         "flexsheet experiment stability --hands 12 --json",
-        "flexsheet experiment stability --gestures --hands 1",
     )
 )
 def stability(
@@ -582,23 +519,6 @@ def stability(
         int, typer.Option(min=1, max=100, help="Number of random hands per kind.")
     ] = 4,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the hands.")] = 100,
-    gestures: Annotated[
-        bool,
-        typer.Option(
-            "--gestures",
-            help="Instead, measure the force that the hands feel when they tap, hold, stroke, let "
-            "go and slip off the object.",
-        ),
-    ] = False,
-    graph: Annotated[
-        bool,
-        typer.Option(
-            "--graph",
-            help="With --gestures: run the graph, with the simulated hand that --apparatus "
-            "describes. By default, the gestures run in simulated time.",
-        ),
-    ] = False,
-    apparatus: options.ApparatusOption = None,
     output: options.ResultFolderOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -611,7 +531,6 @@ def stability(
     import json
 
     from flexsheet.launch.experiments import stability as experiment
-    from flexsheet.launch.experiments.hand_gestures import hand_gestures_result, run_gestures
     from flexsheet.launch.experiments.pictures import draw_stability
     from flexsheet.launch.experiments.run import require_scene
     from flexsheet.launch.health.compliance import ForceCurveStage, compute_front_curve
@@ -619,10 +538,6 @@ def stability(
     from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
-    if (graph or apparatus is not None) and not (gestures and graph):
-        raise CommandError(
-            "--graph requires --gestures, and --apparatus requires --gestures and --graph; add them"
-        )
     given = options.with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")
@@ -631,14 +546,6 @@ def stability(
         curve = compute_front_curve(
             loaded, on_progress=lambda stage, done, total: reporters[stage](done, total)
         )
-        if gestures:
-            touched, forces = (
-                run_gestures(launch_file, given, folder, curve, progress, apparatus=apparatus)
-                if graph
-                else hand_gestures_result(loaded, curve, progress, hands=hands, seed=seed)
-            )
-            _report_gestures(touched, forces, folder, as_json=as_json)
-            return
         result = experiment.stability_result(
             loaded,
             make_force_model(loaded.sheet),
@@ -669,40 +576,4 @@ def stability(
             f"error of the predicted critical gain: {median:.0f} % median, "
             f"{error:.0f} % at the 95 % quantile, in {len(result['boundary'])} simulated cases"
         )
-    words.print(f"image: {image}")
-
-
-def _report_gestures(
-    result: dict[str, Any],
-    forces: Mapping[tuple[str, str], FeltForce],
-    folder: Path,
-    *,
-    as_json: bool,
-) -> None:
-    import json
-
-    from flexsheet.launch.experiments.pictures import draw_hand_gestures
-
-    (folder / "gestures.json").write_text(json.dumps(result, indent=1) + "\n")
-    image = folder / "gestures.png"
-    draw_hand_gestures(forces, image)
-    if as_json:
-        print_json({**result, "picture": str(image)})
-        return
-    print_columns(
-        result["gestures"],
-        {
-            "gesture": ("gesture", ""),
-            "mass, kg": ("mass_kg", ".3f"),
-            "stiffness, N/m": ("stiffness_n_per_m", ".0f"),
-            "peak force, N": ("peak_force_n", ".2f"),
-            "error, N: peak": ("peak_error_n", ".2f"),
-            "mean": ("mean_error_n", ".3f"),
-            "median, %": ("median_error_percent", ".0f"),
-            "transient, N": ("transient_n", ".2f"),
-            "touches": ("touches", ""),
-            "chatter": ("chatter", ""),
-            "watchdog": ("watchdog_triggers", ""),
-        },
-    )
     words.print(f"image: {image}")

@@ -255,7 +255,7 @@ def follow(
     whole recording is known in advance.
     """
     from flexsheet.launch.experiments import follow as experiment
-    from flexsheet.launch.experiments.gestures import finger_path as load_path
+    from flexsheet.launch.experiments.finger_paths import finger_path as load_path
 
     given = options.with_scene(settings, scene)
     path = load_path(launch_file, finger_path, given)

@@ -32,7 +32,6 @@ from scipy.sparse import csr_array, diags_array, hstack, kron, vstack
 from flexsheet.launch.bags.report.followed import MAX_CONTACT_HEIGHT_M
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.demo import read_followed_path
-from flexsheet.launch.experiments.gestures import read_gestures
 from flexsheet.launch.experiments.run import (
     Progress,
     make_stroke_procedure,
@@ -43,8 +42,9 @@ from flexsheet.launch.experiments.simulated_time import follow_in_simulated_time
 from flexsheet.launch.experiments.true_geometry import place_edges
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
+from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath
+from flexsheet.messages.types import FingerPath, TwinFinger
 from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.rigid import (
     apply,
@@ -436,11 +436,7 @@ def run_follow(
         procedure = make_stroke_procedure([], progress, path=path)
         run_experiment(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         followed = read_followed_path(bag, path.label)
-        recorded = read_gestures(bag)
-        begin_ns, end_ns = recorded.windows_ns[path.label]
-        inside = (recorded.truth.times_ns >= begin_ns) & (recorded.truth.times_ns <= end_ns)
-        times_s = np.asarray((recorded.truth.times_ns[inside] - begin_ns) * 1e-9, np.float64)
-        positions = recorded.truth.positions[inside]
+        times_s, positions = _read_true_finger(bag, path.label)
     bound = bound_errors(scene, times_s, positions, progress, apparatus=truth)
     contact = followed["contact"]["true_delta_d_mm"]
     return {
@@ -452,3 +448,15 @@ def run_follow(
         "apparatus": "nominal" if truth is None else truth.origin,
         "bag": None if bag is None else str(bag),
     }
+
+
+def _read_true_finger(bag: Path, label: str) -> tuple[Floats, Floats]:
+    """Return the times (n,), s, and the true positions (n, 3), m, of the finger on a path."""
+    positions: dict[int, Floats] = {}
+    for _, message, header, _ in BagReader(bag, topics=["twin/finger"]):
+        assert isinstance(message, TwinFinger)
+        if message.path_label == label and message.path_time_s >= 0.0 and not message.path_done:
+            positions[header.source_ns] = message.position_world_m
+    times_ns = np.array(sorted(positions), dtype=np.int64)
+    times_s = np.asarray((times_ns - times_ns[0]) * 1e-9, dtype=np.float64)
+    return times_s, np.array([positions[at_ns] for at_ns in times_ns.tolist()])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from flexsheet.launch.experiments.hand_gestures import FeltForce
 from flexsheet.launch.experiments.image import EyeImage
 from flexsheet.launch.experiments.stroke import (
     PAPER_TABLE_1,
@@ -244,29 +243,6 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
     compared.set_xlabel("simulated critical slope")
     compared.set_ylabel("predicted critical slope")
     compared.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
-
-
-def draw_hand_gestures(forces: Mapping[tuple[str, str], FeltForce], path: Path) -> None:
-    """Draw the felt force and the object's force against time.
-
-    The figure has one row per hand and one column per gesture.
-
-    forces: felt and object forces; a key is (kind of hand, gesture).
-    """
-    hands, names = (list(dict.fromkeys(key[number] for key in forces)) for number in (0, 1))
-    figure = Figure(figsize=(3.4 * len(names), 2.2 * len(hands)), layout="constrained")
-    panels = figure.subplots(len(hands), len(names), squeeze=False, sharex="col")
-    for (hand, name), force in forces.items():
-        panel = panels[hands.index(hand)][names.index(name)]
-        panel.plot(force.times_s, force.wanted_n, color="0.5", label="object")
-        panel.plot(force.times_s, force.felt_n, color="C0", linewidth=0.8, label="felt")
-        panel.set_title(f"{name}, hand of {hand}", fontsize=9)
-    for row in panels:
-        row[0].set_ylabel("force, N")
-    for panel in panels[-1]:
-        panel.set_xlabel("time, s")
-    panels[0][0].legend(fontsize=8)
     figure.savefig(path, dpi=110)
 
 
