@@ -14,43 +14,35 @@ if TYPE_CHECKING:
 
 
 class NoteCode(StrEnum):
-    """The kind of a note. `REMEDIES` states what to do about each kind except INFO."""
+    """The kind of a note. `NOTE_REMEDIES` states what to do about each kind except INFO."""
 
     INFO = "info"
     WAITING_FOR_SCENE = "waiting-for-scene"
-    ARM_DISCONNECTED = "arm-disconnected"
+    ARM_BLOCKED = "arm-blocked"
     ARM_ESTOP = "arm-estop"
     ARM_FAULT = "arm-fault"
-    ARM_NOT_ENABLED = "arm-not-enabled"
-    ARM_PATH_BLOCKED = "arm-path-blocked"
+    ARM_NOT_READY = "arm-not-ready"
+    ARM_SILENT = "arm-silent"
     ARM_WAITS = "arm-waits"
     CAMERA_SETTINGS = "camera-settings"
     COMMANDS_UNANSWERED = "commands-unanswered"
-    FINGERTIPS_LATE = "fingertips-late"
+    EYES_OF_SCENE = "eyes-of-scene"
     FINGER_PATH_REFUSED = "finger-path-refused"
-    FORCE_NOT_POSSIBLE = "force-not-possible"
-    FORCE_TABLE_MISSING = "force-table-missing"
+    FINGERTIPS_LATE = "fingertips-late"
+    FORCE_LIMITED = "force-limited"
     FRAME_NOT_RENDERED = "frame-not-rendered"
     FRAMES_MISSED = "frames-missed"
-    HAND_CAN_OSCILLATE = "hand-can-oscillate"
     NO_IMAGES = "no-images"
     NO_PROJECTOR = "no-projector"
     NOT_RECORDING = "not-recording"
-    OBJECT_TOO_SOFT = "object-too-soft"
     OSCILLATIONS_STOPPED = "oscillations-stopped"
     PAIRS_REJECTED = "pairs-rejected"
-    SHEET_FOLDED = "sheet-folded"
-    SHEET_PLANE_OLD = "sheet-plane-old"
+    SHEET_POSE_OLD = "sheet-pose-old"
     SHEET_SHAPE_INACCURATE = "sheet-shape-inaccurate"
-    SHEET_SHAPES_MISSING = "sheet-shapes-missing"
     SOFT_BODY_COMPUTING = "soft-body-computing"
     SOFT_BODY_FAILED = "soft-body-failed"
     SOURCE_ENDED = "source-ended"
-    STAMPED_ON_ARRIVAL = "stamped-on-arrival"
-    TABLE_MISSING = "table-missing"
-    WINDOW_CLOSED = "window-closed"
-    WINDOW_LOST = "window-lost"
-    WINDOW_SIZE = "window-size"
+    WINDOW = "window"
 
 
 class Note(MessagePart):
@@ -66,6 +58,36 @@ class Note(MessagePart):
 
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
+NOTE_REMEDIES: dict[NoteCode, str] = {
+    NoteCode.WAITING_FOR_SCENE: "Wait a few seconds. If it remains, read `flexsheet logs`.",
+    NoteCode.ARM_BLOCKED: "Move the arms nearer to the sheet by hand, or move the sheet.",
+    NoteCode.ARM_ESTOP: "Remove the reason of the e-stop. Then run `flexsheet arms reset`.",
+    NoteCode.ARM_FAULT: "Remove the cause that is named. Then run `flexsheet arms reset`.",
+    NoteCode.ARM_NOT_READY: "Check that nobody is near the arms. Then run `flexsheet arms enable`.",
+    NoteCode.ARM_SILENT: "Check power, address and cable of the arm's controller, and its program.",
+    NoteCode.ARM_WAITS: BUSY_FIRST + "Then compare rates: `flexsheet topic hz sheet_target`.",
+    NoteCode.CAMERA_SETTINGS: "Choose settings in the scene that the camera supports.",
+    NoteCode.COMMANDS_UNANSWERED: BUSY_FIRST + "Then check the cable and the network of the arm.",
+    NoteCode.EYES_OF_SCENE: "Check the program that measures the eyes: `flexsheet topic echo eye`.",
+    NoteCode.FINGER_PATH_REFUSED: "Correct the path, and publish it again: `flexsheet topic pub`.",
+    NoteCode.FINGERTIPS_LATE: "If the number grows steadily: " + BUSY_FIRST,
+    NoteCode.FORCE_LIMITED: "Choose another object or sheet: `flexsheet doctor compliance SCENE`.",
+    NoteCode.FRAME_NOT_RENDERED: "Set `stereo` of the topic `display` to `mono`.",
+    NoteCode.FRAMES_MISSED: "If the number grows steadily: " + BUSY_FIRST,
+    NoteCode.NO_IMAGES: "Correct the cable, the device, or the file of the parameter `source`.",
+    NoteCode.NO_PROJECTOR: "Add `projector` to the scene if an image is wanted.",
+    NoteCode.NOT_RECORDING: "Free space on the disk; the next bag then starts automatically.",
+    NoteCode.OSCILLATIONS_STOPPED: "If they recur, reduce the delay or use a stiffer object.",
+    NoteCode.PAIRS_REJECTED: "Synchronise the cameras by a trigger, or increase `max_skew_s`.",
+    NoteCode.SHEET_POSE_OLD: BUSY_FIRST + "The image recovers automatically.",
+    NoteCode.SHEET_SHAPE_INACCURATE: "Run the command that is named, or push less deeply.",
+    NoteCode.SOFT_BODY_COMPUTING: "Wait, or run `flexsheet precompute SCENE` before the start.",
+    NoteCode.SOFT_BODY_FAILED: "Correct the named cause, and start the graph again.",
+    NoteCode.SOURCE_ENDED: "Start the graph again, or set `loop` of the parameter `source`.",
+    NoteCode.WINDOW: "Set the size of the projector's mode in the scene; check its cable.",
+}
+"""The remedy for each kind of note. The documentation contains this table."""
+
 SHEET_REASON_TEXTS: dict[SheetReason, str] = {
     "ok": "",
     "fingertip_invalid": "the fingertip is not tracked",
@@ -83,38 +105,6 @@ SHEET_REASON_TEXTS: dict[SheetReason, str] = {
     "concave_contact": "the object is concave there, and the flat sheet touches its rim",
 }
 """The texts that the console displays for each `reason` in the topic `sheet_target`."""
-
-SHEET_REASON_REMEDIES: dict[SheetReason, str] = {
-    "fingertip_invalid": "`flexsheet topic echo fingertip --field reason` prints the reason.",
-    "fingertip_not_finite": "Report this error of the triangulator, with a recording.",
-    "fingertip_too_old": BUSY_FIRST + "Then check camera and triangulator: `flexsheet status`.",
-    "fingertip_in_future": "Check the clocks of the hosts: `flexsheet doctor hosts`.",
-    "implausible_input": "Move the finger slowly into the working range, and cover reflections.",
-    "ambiguous_side": "Lift the finger out of the object, and approach it from one side.",
-    "through_object": "Lift the finger, and approach the object from the front again.",
-    "past_object_edge": "Move the finger back to the object's surface.",
-    "beyond_tilt": "Move the finger back, or allow more tilt: `working_range` of the scene.",
-    "beyond_spin": "Lift the finger and touch the object again.",
-    "past_sheet_width": "Move the finger towards the middle of the sheet.",
-    "past_sheet_height": "Move the finger towards the middle of the sheet.",
-    "concave_contact": "Touch the object beside the hollow: a flat sheet cannot enter it.",
-}
-"""The remedy for each `reason` in the topic `sheet_target`, except "ok"."""
-
-
-FINGERTIP_REASON_TEXTS: dict[FingertipReason, str] = {
-    "no_marker": "no marker was found",
-    "marker_in_one_view": "only one camera sees the marker",
-    "two_markers": "there are several possible markers",
-    "merged": "the marker's image touches another bright spot",
-    "blurred": "the marker moves too fast for the exposure",
-    "saturated": "the marker is overexposed",
-    "outside_volume": "the marker is outside the finger's possible positions",
-    "inconsistent": "the rays of the two cameras do not intersect",
-    "too_fast": "the marker is faster than a finger",
-    "unconfirmed": "there are too few detections for a track",
-}
-"""The meaning of each `reason` in the topic `fingertip`, except "ok"."""
 
 FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
     "no_marker": "Move the finger into view, replace a lost marker, or use a longer exposure.",

@@ -25,7 +25,7 @@ import asyncio
 import inspect
 import json
 from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import (
@@ -528,6 +528,10 @@ class Node:
     def set_note(self, code: NoteCode, detail: str = "") -> None:
         """Replace the notes in the node's status by one note."""
         self.notes = (Note(code=code, detail=detail),)
+
+    def set_notes(self, details: Mapping[NoteCode, str]) -> None:
+        """Replace the notes in the node's status by the notes whose detail is not empty."""
+        self.notes = tuple(Note(code=code, detail=text) for code, text in details.items() if text)
 
     @property
     def note(self) -> str:

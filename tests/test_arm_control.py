@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.types import ArmState, EStop, Side
 from flexsheet.nodes.arm_bridge import other_arm
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
@@ -474,7 +475,7 @@ async def test_without_a_scene_the_node_waits() -> None:
     )
     await node.setup()
     await node.cycle()
-    assert node.note == "waits for the scene"
+    assert [one.code for one in node.notes] == [NoteCode.WAITING_FOR_SCENE]
     assert not any(isinstance(message, ArmState) for message in sent)
     await node.close()
 

@@ -24,6 +24,7 @@ from camera_bench import (
 from pydantic import ValidationError
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import Note, NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.camera.devices import ReaderThread, open_reader
@@ -67,8 +68,10 @@ async def test_two_video_files_are_played_to_their_end(
 ) -> None:
     source = {"kind": "video", "left": videos[0], "right": videos[1]}
     async with running(scene, source=source) as bench:
-        await bench.until(lambda: "ended" in bench.node.note)
-        assert bench.node.note == f"{FRAMES} pairs read, and the source has ended"
+        await bench.until(lambda: NoteCode.SOURCE_ENDED in [one.code for one in bench.node.notes])
+        assert bench.node.notes == (
+            Note(code=NoteCode.SOURCE_ENDED, detail=f"{FRAMES} pairs read"),
+        )
         # A busy machine publishes only the newest.
         numbers = bench.numbers()
         assert numbers == sorted(set(numbers) & set(IN_ORDER))
@@ -82,7 +85,7 @@ async def test_two_video_files_are_played_to_their_end(
 async def test_a_side_by_side_video_is_cut_in_the_middle(scene: Scene, side_by_side: Path) -> None:
     source = {"kind": "video", "left": side_by_side, "rate_hz": 200.0}
     async with running(scene, source=source) as bench:
-        await bench.until(lambda: "ended" in bench.node.note)
+        await bench.until(lambda: NoteCode.SOURCE_ENDED in [one.code for one in bench.node.notes])
         assert all(left == right for left, right in bench.numbers())
         assert bench.sent[0][0].left.shape == (HEIGHT, WIDTH)
 
@@ -91,7 +94,7 @@ async def test_a_video_starts_again_when_it_loops(scene: Scene, videos: tuple[Pa
     source = {"kind": "video", "left": videos[0], "right": videos[1], "rate_hz": 100, "loop": True}
     async with running(scene, source=source) as bench:
         await bench.until(lambda: bench.numbers().count((0, 0)) >= 3)
-        assert "ended" not in bench.node.note
+        assert NoteCode.SOURCE_ENDED not in [one.code for one in bench.node.notes]
 
 
 def test_images_come_in_the_order_of_their_names(scene: Scene, images: dict[str, str]) -> None:

@@ -21,6 +21,7 @@ from camera_bench import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.camera.devices import ReaderThread, open_reader
 from flexsheet.nodes.camera.files import read_times
@@ -110,7 +111,7 @@ def test_a_rate_overrides_the_files_times(scene: Scene, tmp_path: Path) -> None:
 async def test_the_published_stamps_follow_the_files_time(scene: Scene, tmp_path: Path) -> None:
     path = write_timed_video(tmp_path / "v.mkv", both([*range(FRAMES)]), UNEVEN_MS)
     async with running(scene, source={"kind": "video", "left": path}) as bench:
-        await bench.until(lambda: "ended" in bench.node.note)
+        await bench.until(lambda: NoteCode.SOURCE_ENDED in [one.code for one in bench.node.notes])
     shown = [(read_number(pair.left), header.source_ns) for pair, header in bench.sent]
     begin_ns = shown[0][1]
     assert shown[0][0] == 0

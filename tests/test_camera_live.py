@@ -209,7 +209,7 @@ async def test_the_skew_is_published_and_too_much_is_rejected(
         left.shoot(PERIOD_NS)
         right.shoot(PERIOD_NS - 6 * MS)
         await bench.until(lambda: bench.node.rejected == 1)
-        assert "1 pairs rejected: -6.0 ms between left and right exposure" in bench.node.note
+        assert "pairs-rejected: 1, -6.0 ms between left and right exposure" in bench.node.note
         left.shoot(2 * PERIOD_NS)
         right.shoot(2 * PERIOD_NS + MS)
         await bench.until(lambda: len(bench.sent) == 2)
@@ -381,7 +381,7 @@ async def test_a_camera_is_unplugged_and_comes_back(
         right.unplug()
         left.shots.put(None)
         await bench.until(lambda: "cannot be opened" in bench.node.note)
-        assert bench.node.note.startswith("no images: 2 cannot be opened")
+        assert bench.node.note.startswith("no-images: 2 cannot be opened")
         assert all(capture.released.is_set() for capture in right.captures)
         tried = len(left.captures)
         await bench.until(lambda: len(left.captures) > tried)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.bag import BagReader
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.types import (
     Display,
     EStop,
@@ -66,4 +67,4 @@ async def test_a_recorder_that_cannot_start_reports_it_and_continues(tmp_path: P
     await node.setup()
     node.deliver("in/recording", *frames_of(Recording(running=True)))
     assert node.errors == 1
-    assert "NOT RECORDING" in node.note
+    assert [one.code for one in node.notes] == [NoteCode.NOT_RECORDING]

@@ -15,12 +15,12 @@ from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.bag import BagError
 from flexsheet.messages.errors import FlexsheetError, describe_error
 from flexsheet.messages.notes import (
-    FINGERTIP_REASON_TEXTS,
     FINGERTIP_REMEDIES,
+    NOTE_REMEDIES,
     SELF_CHECK_FINDINGS,
     SELF_CHECK_REMEDIES,
-    SHEET_REASON_REMEDIES,
     SHEET_REASON_TEXTS,
+    NoteCode,
 )
 from flexsheet.messages.topics import UnknownTopicError, find_topic
 from flexsheet.messages.types import FingertipReason, SheetReason, SuspectedCause
@@ -53,13 +53,16 @@ def test_a_remedy_follows_the_text_of_an_error() -> None:
 
 def test_every_reason_of_an_invalid_fingertip_has_a_remedy() -> None:
     reasons = set(get_args(FingertipReason)) - {"ok"}
-    assert set(FINGERTIP_REMEDIES) == set(FINGERTIP_REASON_TEXTS) == reasons
+    assert set(FINGERTIP_REMEDIES) == reasons
 
 
-def test_every_reason_of_a_sheet_at_rest_has_a_text_and_a_remedy() -> None:
+def test_every_reason_of_a_sheet_at_rest_has_a_text() -> None:
     reasons = set(get_args(SheetReason))
     assert set(SHEET_REASON_TEXTS) == reasons
-    assert set(SHEET_REASON_REMEDIES) == reasons - {"ok"}
+
+
+def test_every_note_except_information_has_a_remedy() -> None:
+    assert set(NOTE_REMEDIES) == set(NoteCode) - {NoteCode.INFO}
 
 
 def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:

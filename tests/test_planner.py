@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.notes import Note, NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import FingertipReason, SheetTarget, SoftBody
@@ -438,7 +439,7 @@ async def test_an_old_fingertip_is_held_and_one_out_of_order_left_out() -> None:
     count = len(desk.sent)
     await desk.see(in_world(on_cylinder(30.0, 0.02)), after_ns=-FRAME_NS)
     assert len(desk.sent) == count
-    assert "late fingertips dropped: 1" in desk.planner.note
+    assert Note(code=NoteCode.FINGERTIPS_LATE, detail="1") in desk.planner.notes
 
 
 @examples(10)

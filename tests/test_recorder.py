@@ -26,6 +26,7 @@ from flexsheet.messages import bag
 from flexsheet.messages.bag import FLUSH_PERIOD_S, BagError, BagReader, BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import EStop
 from flexsheet.messages.wire import encode, read_envelope
@@ -171,7 +172,7 @@ async def test_a_failing_disk_is_reported_and_losses_are_counted(
         node.watch_disk()
     assert node.inputs["in/estop"].counts.dropped == 3
     assert node.errors == 1
-    assert node.note.startswith("NOT RECORDING")
+    assert [one.code for one in node.notes] == [NoteCode.NOT_RECORDING]
     assert "Input/output error" in node.note
     # It is asked again after a while, in vain, and then it has come back.
     clock.move_to(clock.now_ns() + RETRY_NS)
@@ -236,7 +237,7 @@ async def test_on_a_full_disk_the_bag_ends_readable_and_another_follows(
     if keep_free_bytes:
         node.watch_disk()
     send(300)
-    assert node.note.startswith("NOT RECORDING")
+    assert [one.code for one in node.notes] == [NoteCode.NOT_RECORDING]
     lost = node.inputs["in/status"].counts.dropped
     assert lost == 300 if keep_free_bytes else 100 < lost <= 200
     first = BagReader(small_disk / "a.mcap")
@@ -247,7 +248,9 @@ async def test_on_a_full_disk_the_bag_ends_readable_and_another_follows(
     assert 320 - lost - 60 <= len(kept) <= 320 - lost
     filler.unlink()
     node.watch_disk()
-    assert node.note.startswith("NOT RECORDING"), "it is not asked again at once"
+    assert [one.code for one in node.notes] == [NoteCode.NOT_RECORDING], (
+        "it is not asked again at once"
+    )
     clock.move_to(clock.now_ns() + RETRY_NS)
     node.watch_disk()
     send(20)

@@ -11,6 +11,7 @@ import pytest
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     Correction,
@@ -501,11 +502,11 @@ async def test_stale_arms_keep_the_last_plane_and_are_reported(bench: Bench) -> 
     pose = transform(rotation_from_vector([0.5, 0.0, 0.0]), [0.0, 0.0, 0.0])
     await bench.arms(pose)
     await bench.finger(0.0, 0.0, 0.1)
-    assert "keeping" not in bench.node.note
+    assert NoteCode.SHEET_POSE_OLD not in [one.code for one in bench.node.notes]
     bench.forward(500)
     await bench.finger(0.0, 0.0, 0.1)
     assert np.allclose(bench.sent[-1][0].world_from_sheet, pose, atol=1e-9)
-    assert "the arm poses are 0.50 s old: keeping" in bench.node.note
+    assert "sheet-pose-old: the arm poses are 0.50 s old" in bench.node.note
 
 
 async def test_with_a_slow_camera_older_poses_are_used(bench: Bench) -> None:
@@ -517,7 +518,7 @@ async def test_with_a_slow_camera_older_poses_are_used(bench: Bench) -> None:
         await bench.step("fingertip", tip, age_ms=4.0, sequence=number)
     bench.forward(200)
     await bench.finger(0.0, 0.0, 0.1)
-    assert "keeping" not in bench.node.note
+    assert NoteCode.SHEET_POSE_OLD not in [one.code for one in bench.node.notes]
 
 
 async def test_sheet_turned_away_holds_the_last_plane(bench: Bench) -> None:

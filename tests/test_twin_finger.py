@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Lens, Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
@@ -394,8 +395,9 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
     )
     await node.step("twin__finger_path", fast, header())
     assert node.errors == 0
-    assert node.note.startswith('refused finger path "fast": path: the speed')
+    assert node.note.startswith('finger-path-refused: "fast": path: the speed')
     assert node.note.endswith("increase the times")
+    assert [one.code for one in node.notes] == [NoteCode.FINGER_PATH_REFUSED]
     assert np.array_equal(node.truth(10**9).position, before)
     far = fast.model_copy(
         update={
@@ -430,10 +432,15 @@ async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(
         clock.move_to(clock.now_ns() + 200_000_000)
         frames = await sent.until("twin/stereo", 12)
         # The number increases before the note that states it.
-        busy = "frames missed because the computer was busy"
-        await until(lambda: node.note == f"{node.missed_frames} {busy}")
+        busy = "because the computer was busy"
+        await until(lambda: node.note == f"frames-missed: {node.missed_frames} {busy}")
         node.path_label = "stroke"
-        await until(lambda: node.note == f'follows the path "stroke", {node.missed_frames} {busy}')
+        await until(
+            lambda: (
+                node.note
+                == f'follows the path "stroke"; frames-missed: {node.missed_frames} {busy}'
+            )
+        )
     finally:
         await node.close()
     period_ns = round(1e9 / scene.camera.rate_hz)

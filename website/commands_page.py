@@ -11,8 +11,8 @@ from typer.main import get_command
 from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import examples_in
 from flexsheet.messages.notes import (
-    FINGERTIP_REASON_TEXTS,
     FINGERTIP_REMEDIES,
+    NOTE_REMEDIES,
     SELF_CHECK_FINDINGS,
     SELF_CHECK_REMEDIES,
 )
@@ -73,20 +73,20 @@ def _description(parameter: Any) -> str:
 
 
 def render_errors() -> str:
-    """Return the tables of reasons and causes."""
+    """Return the tables of notes, reasons and causes."""
     short = "what to do"
-    reasons = [
-        (f"`{reason}`", FINGERTIP_REASON_TEXTS[reason], remedy)
-        for reason, remedy in FINGERTIP_REMEDIES.items()
-    ]
+    notes = [(f"`{code}`", remedy) for code, remedy in NOTE_REMEDIES.items()]
+    reasons = [(f"`{reason}`", remedy) for reason, remedy in FINGERTIP_REMEDIES.items()]
     causes = [
         (f"`{cause}`", finding, SELF_CHECK_REMEDIES[cause])
         for cause, finding in SELF_CHECK_FINDINGS.items()
     ]
     return "\n".join(
         [
+            "## Notes of nodes\n",
+            format_table(("code", short), notes),
             "## Reasons of an invalid fingertip\n",
-            format_table(("`reason`", "meaning", short), reasons),
+            format_table(("`reason`", short), reasons),
             "## Causes that self-checks suspect\n",
             format_table(("`cause`", "meaning", short), causes),
         ]

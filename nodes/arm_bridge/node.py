@@ -7,10 +7,12 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     Arming,
     ArmLatency,
+    ArmMode,
     ArmState,
     EStop,
     SheetTarget,
@@ -37,6 +39,13 @@ MIN_SERVO_LAG_S = 0.002
 
 CHECK_PERIOD_NS = 100_000_000
 """The period of the arm's self-checks. The results are published once per second."""
+
+MODE_CODES: dict[ArmMode, NoteCode] = {
+    "starting": NoteCode.ARM_SILENT,
+    "disconnected": NoteCode.ARM_SILENT,
+    "estop": NoteCode.ARM_ESTOP,
+    "fault": NoteCode.ARM_FAULT,
+}
 
 
 class ArmBridge(Node):
@@ -140,7 +149,7 @@ class ArmBridge(Node):
     async def cycle(self) -> None:
         """Send periodic commands to the arm while no targets arrive."""
         if self._geometry is None:
-            self.note = "waits for the scene"
+            self.set_note(NoteCode.WAITING_FOR_SCENE)
             return
         now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
         if self._control.is_idle:
@@ -158,14 +167,27 @@ class ArmBridge(Node):
         if self._link.due(now_ns):
             await self._exchange(geometry, other, step_s)
         control = self._control
-        doing = f"{control.mode} {control.reason}".rstrip()
-        self.note = doing
-        if self._failures:
-            self.note += f"; {self._failures} failed exchanges (two in a row stop the arm)"
+        failures = f"{self._failures} (two in a row stop the arm)" if self._failures else ""
+        self.set_notes(
+            {
+                self._find_note_code(): f"{control.mode} {control.reason}".rstrip(),
+                NoteCode.COMMANDS_UNANSWERED: failures,
+            }
+        )
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
             state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)
             self.arm.publish(state, source_ns=last.measured_ns)
+
+    def _find_note_code(self) -> NoteCode:
+        control = self._control
+        if control.path_blocked:
+            return NoteCode.ARM_BLOCKED
+        if control.mode in MODE_CODES:
+            return MODE_CODES[control.mode]
+        if not (control.ready or control.auto_arming):
+            return NoteCode.ARM_NOT_READY
+        return NoteCode.ARM_WAITS if control.reason else NoteCode.INFO
 
     async def _exchange(self, geometry: ArmGeometry, other: OtherArm | None, step_s: float) -> None:
         control, last = self._control, self._last

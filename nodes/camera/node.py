@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Positive, Scene, StereoCamera
 from flexsheet.messages.types import ParameterChange, StereoPair
 from flexsheet.nodes import NodeRole
@@ -121,11 +122,11 @@ class Camera(Node):
         self.reader.start()
 
     def _report_end(self, pairs: int) -> None:
-        self.note = f"{pairs} pairs read, and the source has ended"
+        self.set_note(NoteCode.SOURCE_ENDED, f"{pairs} pairs read")
 
     def _report_failure(self, error: DeviceError) -> None:
         self.report_error("source", error)
-        self.note = f"no images: {error}"
+        self.set_note(NoteCode.NO_IMAGES, str(error))
 
     def _report_opened(self, text: str) -> None:
         if text not in self.opened:
@@ -162,19 +163,19 @@ class Camera(Node):
         limit_s = self.parameters.max_skew_s
         if limit_s is not None and abs(images.skew_s) > limit_s:
             self.rejected += 1
-            self.note = f"{self.rejected} pairs rejected: {describe_skew(images.skew_s, limit_s)}"
+            skew = describe_skew(images.skew_s, limit_s)
+            self.set_note(NoteCode.PAIRS_REJECTED, f"{self.rejected}, {skew}")
             return
         pair = make_stereo_message(images, device, exposure_s, lost + self.rejected)
         offset_ns = round(1e9 * self.parameters.stamp_offset_s)
         self.stereo.publish(pair, source_ns=images.exposure_ns + offset_ns)
-        parts = (
-            device,
-            f"{pair.dropped_frames} frames lost",
-            *images.notes,
-            *self.opened,
-            *self.warned,
+        lost_text = f"{pair.dropped_frames} frames lost"
+        self.set_notes(
+            {
+                NoteCode.INFO: "; ".join((device, lost_text, *images.notes, *self.opened)),
+                NoteCode.CAMERA_SETTINGS: "; ".join(self.warned),
+            }
         )
-        self.note = "; ".join(parts)
 
     async def _stop_reading(self) -> None:
         reader, self.reader = self.reader, None

@@ -7,6 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Positive
 from flexsheet.messages.types import ClockEcho, ClockOffset, ClockPing, Clocks
 from flexsheet.nodes import NodeRole
@@ -85,12 +86,13 @@ class ClockNode(Node):
                 offsets=tuple(one for one in offsets if one is not None),
             )
         )
-        self.note = ", ".join(
+        texts = (
             f"clock offset of {one.clock_id}: {one.offset_ns * 1e-9:+.6f} s, "
             f"uncertainty {one.uncertainty_s * 1e3:.3f} ms"
             for one in offsets
             if one is not None
         )
+        self.set_note(NoteCode.INFO, ", ".join(texts))
 
     def _offset(self, clock_id: str, now_ns: int) -> ClockOffset | None:
         other = self._peers[clock_id]

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Bookmark, Display, EStop, FingerPath, Recording, Skin
@@ -110,7 +111,7 @@ class Console(Node):
             with_eye=further_port("twin/eye") in self.inputs,
         )
         controller.begin()
-        self.note = f"{self.url}, viewers: 0"
+        self.set_note(NoteCode.INFO, f"{self.url}, viewers: 0")
 
     async def close(self) -> None:
         await self.operator.controller.scenes.close()
@@ -136,7 +137,7 @@ class Console(Node):
         """Update the 3D view and all moving elements of the page."""
         now_s = self.clock.now_ns() * 1e-9
         viewers = len(self._server.get_clients())
-        self.note = f"{self.url}, viewers: {viewers}"
+        self.set_note(NoteCode.INFO, f"{self.url}, viewers: {viewers}")
         self._call(self.operator.advance, now_s, viewers > 0)
 
     @periodic("tables_hz")

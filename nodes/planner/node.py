@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.messages.types import (
@@ -125,15 +126,15 @@ class Planner(Node):
             self._actuation.on_latency(arm.side, arm.latency_s)
 
     def _update_note(self) -> None:
-        late = ""
-        if self._late_count:
-            late = f"late fingertips dropped: {self._late_count}"
-        compliance = self._compliance.note if self._compliance is not None else ""
-        stopped = ""
-        if self._stopped_oscillations:
-            stopped = f"oscillations of finger and sheet stopped: {self._stopped_oscillations}"
-        model = f"sheet force model: {self._model_text}"
-        self.note = "; ".join(filter(None, (compliance, late, stopped, model)))
+        stopped = self._stopped_oscillations
+        self.set_notes(
+            {
+                NoteCode.FORCE_LIMITED: "" if self._compliance is None else self._compliance.note,
+                NoteCode.FINGERTIPS_LATE: str(self._late_count) if self._late_count else "",
+                NoteCode.OSCILLATIONS_STOPPED: str(stopped) if stopped else "",
+                NoteCode.INFO: f"sheet force model: {self._model_text}",
+            }
+        )
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         trajectory, compliance = self._trajectory, self._compliance

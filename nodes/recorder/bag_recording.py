@@ -17,6 +17,7 @@ from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.files import free_bytes
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
@@ -28,7 +29,7 @@ RETRY_NS = 5_000_000_000
 class BagRecording:
     """A recorder that writes messages to bags while recording is requested.
 
-    note: state of the recording, as one line of text.
+    note: code and detail of the note about the recording.
     lost: number of messages that were lost since the last bag ended.
 
     A bag is closed when the free disk space falls to `keep_free_bytes`. The remaining space is
@@ -54,7 +55,7 @@ class BagRecording:
         self._retry_ns = self._bag_started_ns = 0
         self.requested = False
         self.lost = 0
-        self.note = "waits for a request to record"
+        self.note = NoteCode.INFO, "waits for a request to record"
 
     @property
     def path(self) -> Path | None:
@@ -89,7 +90,7 @@ class BagRecording:
                 self.requested, bag, self._bag = False, self._bag, None
                 if bag is not None:
                     bag.close()
-                    self.note = f"recorded: {bag.messages} messages in {bag.path}"
+                    self.note = NoteCode.INFO, f"recorded: {bag.messages} messages in {bag.path}"
         except (BagError, OSError) as error:
             self._end_bag(error)
 
@@ -173,12 +174,12 @@ class BagRecording:
         self._note_progress(bag)
 
     def _note_progress(self, bag: BagWriter) -> None:
-        self.note = f"recording: {bag.messages} messages in {bag.path}"
+        self.note = NoteCode.INFO, f"recording: {bag.messages} messages in {bag.path}"
 
     def _end_bag(self, error: Exception) -> None:
         bag, self._bag = self._bag, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
-        self.note = f"NOT RECORDING: {error}"
+        self.note = NoteCode.NOT_RECORDING, str(error)
         self._on_error(error)
         if bag is not None:
             # The disk error is already reported, and a truncated bag can still be read.

@@ -55,13 +55,13 @@ class Recorder(Node):
         if not self.parameters.start_paused:
             self._recording.start()
             self.log.info("recording", bag=str(self._recording.path), inputs=len(self.inputs))
-        self.note = self._recording.note
+        self.set_note(*self._recording.note)
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
         """End the bag before the disk is full; start a new bag when enough space is free again."""
         self._recording.check_disk()
-        self.note = self._recording.note
+        self.set_note(*self._recording.note)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
         """Write the ZeroMQ frames of a message to the bag without decoding them."""
@@ -70,7 +70,7 @@ class Recorder(Node):
         if self.parameters.start_paused and source.topic.message is Recording:
             self._recording.set_requested(decode(message, Recording)[0].running)
         source.counts.dropped += self._recording.write(source.topic, message, header)
-        self.note = self._recording.note
+        self.set_note(*self._recording.note)
 
     async def close(self) -> None:
         self._recording.close()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexsheet.messages.clock import Clock
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.types import (
     ArmState,
     Display,
@@ -63,7 +64,7 @@ class FrameRenderer:
         max_age: MaxAge,
     ) -> None:
         self.scene_renderer = scene_renderer
-        self.note = ""
+        self.notes: dict[NoteCode, str] = {}
         self.late = self.superseded = 0
         self._output, self._ports, self._latency, self._clock = screen, ports, latency, clock
         self._max_age = max_age
@@ -131,9 +132,11 @@ class FrameRenderer:
         if not self._output.is_seen:
             light_ns = self._latency.record_drawn(begun_ns, drawn_ns)
             self.late += self._latency.is_late(light_ns, predicted_to_ns)
-        self.note = "; ".join(
-            filter(None, (self._sheet_predictor.note, scene_renderer.note, eye_note))
-        )
+        self.notes = {
+            NoteCode.SHEET_POSE_OLD: self._sheet_predictor.note,
+            NoteCode.SHEET_SHAPE_INACCURATE: scene_renderer.note,
+            NoteCode.EYES_OF_SCENE: eye_note,
+        }
         frame = Frame(
             number=self._number,
             correction=shown.correction,

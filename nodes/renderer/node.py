@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.methods import resolve_method
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     ArmState,
@@ -81,7 +82,7 @@ class Renderer(Node):
     def on_scene(self, scene: Scene, header: Header) -> None:
         self._frame_renderer = None
         if scene.projector is None:
-            self.note = "no image: the scene has no projector"
+            self.set_note(NoteCode.NO_PROJECTOR)
             return
         self._output.open((scene.projector.width_px, scene.projector.height_px))
         given = self.parameters
@@ -174,7 +175,7 @@ class Renderer(Node):
         frame, source_ns = frame_renderer.render(self._shown, begun_ns, with_pixels=with_pixels)
         if with_pixels:
             self._since_pixels = 0
-        self.note = "; ".join(filter(None, (frame_renderer.note, self._output.note)))
+        self.set_notes({**frame_renderer.notes, NoteCode.WINDOW: self._output.note})
         if self._output.is_seen:
             self._output.show((frame, source_ns), self._shown)
         else:

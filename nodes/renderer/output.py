@@ -28,10 +28,10 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
     if tracked is None:
         return eyes, across, ""
     if not tracked.valid:
-        return eyes, across, "the eyes are not tracked; the eyes of the scene are used"
+        return eyes, across, "the eyes are not tracked"
     length = float(np.linalg.norm(tracked.right_world))
     if length < 1e-6:
-        return eyes, across, "topic eye: right_world is zero; the eyes of the scene are used"
+        return eyes, across, "topic eye: right_world is zero"
     across = np.asarray(tracked.right_world / length, dtype=np.float64)
     reach = 0.5 * eyes.interocular_m * abs(float(across[2]))
     if tracked.centre_world_m[2] - reach < MIN_EYE_DISTANCE_M:
@@ -40,7 +40,7 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
             eyes,
             np.array([1.0, 0.0, 0.0]),
             f"a tracked eye is {where} from the screen, which is less than the minimum of "
-            f"{MIN_EYE_DISTANCE_M:g} m; the eyes of the scene are used",
+            f"{MIN_EYE_DISTANCE_M:g} m",
         )
     return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
 

@@ -66,7 +66,7 @@ class SheetPosePredictor:
         if sheet is None:
             fresh = age_s <= self._max_age.seconds
             why = "implausible flange poses" if fresh else f"the arm poses are {age_s:.2f} s old"
-        self.note = f"{why}: keeping the last valid sheet plane"
+        self.note = why
         if self._sheet is None:
             self._sheet = scene_renderer.sheet_at_rest()
         return self._sheet

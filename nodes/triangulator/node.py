@@ -20,6 +20,7 @@ from flexsheet.messages.marker_calibration import (
     refuse_other_marker,
 )
 from flexsheet.messages.methods import resolve_method
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     Fingertip,
@@ -250,4 +251,5 @@ class Triangulator(Node):
 
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
-        self.note = f"{counts}; image pairs dropped as late: {self.late}; methods: {self.methods}"
+        late = f"image pairs dropped as late: {self.late}"
+        self.set_note(NoteCode.INFO, f"{counts}; {late}; methods: {self.methods}")

@@ -15,6 +15,7 @@ from pydantic import AfterValidator, Field
 
 from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes import NodeRole
@@ -216,7 +217,7 @@ class TwinArmsNode(Node):
     @periodic("rate_hz")
     async def cycle(self) -> None:
         if len(self.servers) < 2:
-            self.note = "waits for the scene"
+            self.set_note(NoteCode.WAITING_FOR_SCENE)
             return
         for side in self.servers:
             self._advance(side)
@@ -241,7 +242,8 @@ class TwinArmsNode(Node):
                 world_from_flange_right=right,
             )
         )
-        self.note = ", ".join(
+        texts = (
             f"{side}: {one.commands} commands, refused: {one.refused}"
             for side, one in ((side, server.controller) for side, server in self.servers.items())
         )
+        self.set_note(NoteCode.INFO, ", ".join(texts))

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Positive, Projector, Scene
 from flexsheet.messages.types import (
     Display,
@@ -125,9 +126,10 @@ class TwinEyeNode(Node):
         if not frame.pixels or not frame.label or self._queue.is_known(key, self.clock.now_ns()):
             return
         if self.scene.message is None or self.twin__arms.message is None:
-            self.note = "waits for the scene and the simulated arms"
+            self.set_note(NoteCode.WAITING_FOR_SCENE)
         elif frame.stereo != "mono" and frame.eye == "both":
-            self.note = f'frame "{frame.label}" with two views ({frame.stereo}) cannot be rendered'
+            text = f'"{frame.label}" has two views ({frame.stereo})'
+            self.set_note(NoteCode.FRAME_NOT_RENDERED, text)
         elif self._queue.is_full:
             if self._queue.reject(key):
                 self.report_error(
@@ -229,5 +231,5 @@ class TwinEyeNode(Node):
             seen=seen,
             expected=expected,
         )
-        self.note = f'rendered the frame "{frame.label}"'
+        self.set_note(NoteCode.INFO, f'rendered the frame "{frame.label}"')
         self.twin__eye.publish(picture, source_ns=header.source_ns)

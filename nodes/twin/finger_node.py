@@ -19,6 +19,7 @@ from pydantic import Field
 
 from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.base import Header
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import NonNegative, Scene
 from flexsheet.messages.types import FingerPath, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
@@ -175,7 +176,7 @@ class TwinFingerNode(Node):
         try:
             self._follow(path)
         except FingerPathError as error:
-            self.refusal = f'refused finger path "{path.label}": {error}'
+            self.refusal = f'"{path.label}": {error}'
             self.log.warning("finger path", problem=self.refusal)
         self._update_note()
 
@@ -336,16 +337,17 @@ class TwinFingerNode(Node):
         self._update_note()
 
     def _update_note(self) -> None:
-        parts = []
-        if self.path_label:
-            parts.append(f'follows the path "{self.path_label}"')
-        if self.missed_frames:
-            parts.append(f"{self.missed_frames} frames missed because the computer was busy")
+        info = f'follows the path "{self.path_label}"' if self.path_label else ""
         if self.parameters.hand == "coupled" and self.coupled is None:
-            parts.append("the force of the sheet on the finger is being computed")
-        if self.refusal:
-            parts.append(self.refusal)
-        self.note = ", ".join(parts)
+            info = "computes the force of the sheet on the finger"
+        missed = f"{self.missed_frames} because the computer was busy"
+        self.set_notes(
+            {
+                NoteCode.INFO: info,
+                NoteCode.FRAMES_MISSED: missed if self.missed_frames else "",
+                NoteCode.FINGER_PATH_REFUSED: self.refusal,
+            }
+        )
 
     async def _sleep_until(self, at_ns: int) -> None:
         await asyncio.sleep(max(0.0, (at_ns - self.clock.now_ns()) * 1e-9))
