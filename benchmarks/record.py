@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flexsheet.launch.methods.results import machine_name, replace_non_finite
-from flexsheet.launch.running.code_state import read_git_state
+from flexsheet.launch.running.commit import read_commit
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "results"
@@ -40,7 +40,7 @@ def record(name: str, command: Sequence[str], folder: Path = RESULTS) -> Path:
         "command": shlex.join(command),
         "machine": machine_name(),
         "load": round(load, 2),
-        "code": json.loads(read_git_state(ROOT)),
+        "code": {"commit": read_commit()},
         "date": datetime.now(UTC).date().isoformat(),
         "results": replace_non_finite(json.loads(done.stdout)),
     }

@@ -26,11 +26,10 @@ from typing import Any
 import numpy as np
 
 from flexsheet.launch.commands.output import print_rows
-from flexsheet.launch.methods.charts import ROOT
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.launch.running.code_state import read_git_state
+from flexsheet.launch.running.commit import read_commit
 from flexsheet.messages.scene import Scene, require_cylinder, require_material
 from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec
@@ -342,7 +341,7 @@ def measure_all() -> dict[str, Any]:
     print_rows([asdict(point) for point in (*by_size, *by_contact)], as_json=False)
     return {
         "machine": machine_name(),
-        "code": json.loads(read_git_state(ROOT)),
+        "code": {"commit": read_commit()},
         "tables": "of made-up numbers and of the right size, at some of the places",
         BY_SIZE: [asdict(point) for point in by_size],
         BY_CONTACT: [asdict(point) for point in by_contact],

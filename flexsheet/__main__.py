@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from typing import NoReturn
 
 NODE_FLAG = "--node"
-FORK_SERVER_FLAG = "--fork-server"
 
 # Pydantic would search every installed package for plugins; none is used.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
@@ -43,12 +42,6 @@ def main() -> None:
     """Run the `flexsheet` command, or a process with nodes if the arguments are `--node CONFIG`."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
         _run_node(sys.argv[2])
-    if len(sys.argv) == 4 and sys.argv[1] == FORK_SERVER_FLAG:
-        from flexsheet.launch.running.fork_server import serve
-
-        _shorten_imports()
-        # Only the processes that it forks return from `serve`.
-        _run_node(serve(int(sys.argv[2])))
     _avoid_garbage_collection()
     if sys.argv[1:3] == ["arms", "stop"]:
         # Importing the command line takes several times longer than sending the stop.

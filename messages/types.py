@@ -662,32 +662,6 @@ class HostKey(MessagePart):
     key: str
 
 
-class ProgramCpu(MessagePart):
-    """The processor time of all processes with the same name."""
-
-    name: str = Field(description="name of the node, or of another program")
-    cores: NonNegative = Field(description="processor time divided by elapsed time")
-
-
-class CpuPressure(MessagePart):
-    """The time for which the nodes of a computer have waited for a free processor.
-
-    The time is measured over the last few seconds. Nodes with a `nice` value of 10 or more are not
-    included.
-    """
-
-    busy: bool = Field(description="true: `wait_ratio` is above 0.25")
-    wait_ratio: NonNegative = Field(
-        description="longest waiting time of a node divided by the elapsed time"
-    )
-    node: str = Field(description="node with this waiting time")
-    programs: tuple[ProgramCpu, ...] = Field(
-        default=(),
-        description="programs that use the most processor time, in descending order; empty if "
-        "`busy` is false",
-    )
-
-
 class HostStatus(Message):
     """The state of a computer. The launcher on the computer publishes it once per second."""
 
@@ -721,16 +695,6 @@ class HostStatus(Message):
     )
     estop: str | None = Field(
         default=None, description="reason of the latched e-stop; None: no e-stop is latched"
-    )
-    cpu: CpuPressure | None = Field(
-        default=None,
-        description="waiting times for a processor; None: the system does not measure them, or "
-        "no node runs yet",
-    )
-    nice_denied: bool = Field(
-        default=False,
-        description="true: the user is not permitted to set a `nice` value of the launch file, "
-        "so nodes run without their priority",
     )
 
 

@@ -7,11 +7,9 @@ that a process does not load the libraries of other nodes.
 
 from __future__ import annotations
 
-import os
 from difflib import get_close_matches
 from enum import StrEnum
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexsheet.messages.errors import FlexsheetError
@@ -74,14 +72,7 @@ class UnknownNodeError(FlexsheetError, KeyError):
 
 
 class NodeImportError(FlexsheetError, ImportError):
-    """Raised if a node class "module:Class" cannot be imported.
-
-    advice: text that states how to correct this error.
-    """
-
-    def __init__(self, name: str, problem: str, advice: str) -> None:
-        super().__init__(f'"{name}" cannot be imported: {problem}; {advice}')
-        self.problem, self.advice = problem, advice
+    """Raised if a node class "module:Class" cannot be imported."""
 
 
 def node_class(name: str) -> type[Node]:
@@ -102,52 +93,16 @@ def node_class(name: str) -> type[Node]:
     try:
         module = import_module(module_name)
     except (Exception, SystemExit) as error:  # the module can raise anything
-        problem, advice = _describe_import_error(module_name, error)
-        raise NodeImportError(name, problem, advice) from error
+        raise NodeImportError(
+            f'"{name}" cannot be imported: {type(error).__name__}: {error}; write '
+            "PYTHONPATH=FOLDER before the command, where FOLDER contains the module, or correct "
+            f'the module: python -c "import {module_name}" prints the traceback'
+        ) from error
     try:
         # The module is known only at run time, so the type of the class is not.
         return getattr(module, class_name)  # type: ignore[no-any-return]
     except AttributeError as error:
-        advice = f"define the class {class_name} in {module_name}, or correct its name"
-        raise NodeImportError(name, str(error), advice) from error
-
-
-def _describe_import_error(module: str, error: BaseException) -> tuple[str, str]:
-    """Return the text of an error during an import, and an instruction to correct the error."""
-    missing = error.name if isinstance(error, ModuleNotFoundError) else None
-    if missing and (module == missing or module.startswith(f"{missing}.")):
-        return str(error), (
-            "write PYTHONPATH=FOLDER before the command, where FOLDER contains "
-            f"{module.replace('.', '/')}.py, or install the package"
-        )
-    text = error.msg if isinstance(error, SyntaxError) else str(error)
-    problem = f"{_locate_error(module, error)}: {type(error).__name__}: {text}"
-    if missing:
-        return problem, f"install the module {missing}: pip install {missing.partition('.')[0]}"
-    return problem, f"correct the module {module}"
-
-
-def _locate_error(module: str, error: BaseException) -> str:
-    """Return "file:line" of an error during the import of a module, or the name of the module.
-
-    If a library raises the error, the result is the line of the module that calls the library.
-    """
-    import traceback  # imported here, because it is slow and only needed after an error
-    from sysconfig import get_paths
-
-    if isinstance(error, SyntaxError) and error.filename:
-        return f"{error.filename}:{error.lineno}"
-    kinds = ("stdlib", "platstdlib", "purelib", "platlib")
-    folders = (*map(get_paths().get, kinds), Path(__file__).parents[1])
-    libraries = tuple(f"{folder}{os.sep}" for folder in folders)
-    # The first two frames are `node_class` and `import_module`.
-    frames = [
-        frame
-        for frame in traceback.extract_tb(error.__traceback__)[2:]
-        if not frame.filename.startswith("<")
-    ]
-    own = [frame for frame in frames if not frame.filename.startswith(libraries)]
-    if not frames:
-        return module
-    last = (own or frames)[-1]
-    return f"{last.filename}:{last.lineno}"
+        raise NodeImportError(
+            f'"{name}" cannot be imported: {error}; define the class {class_name} in '
+            f"{module_name}, or correct its name"
+        ) from error

@@ -72,38 +72,7 @@ def enter_real_time(priority: int) -> None:
             os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(priority))
 
 
-def leave_real_time(thread: int = 0) -> bool:
-    """Give a thread the normal scheduling policy, and return whether it had real-time priority.
-
-    thread: ID of the thread; 0 means the calling thread.
-    """
-    if os.sched_getscheduler(thread) != os.SCHED_RR:
-        return False
-    os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
-    return True
-
-
-def list_real_time_threads(pid: int) -> list[int]:
-    """Return the ids of the threads of a process that have real-time priority.
-
-    The list is empty if the process has ended.
-    """
-    found = []
-    with suppress(FileNotFoundError, ProcessLookupError):
-        for thread in map(int, os.listdir(f"/proc/{pid}/task")):
-            with suppress(ProcessLookupError):
-                if os.sched_getscheduler(thread) == os.SCHED_RR:
-                    found.append(thread)
-    return found
-
-
-def end_real_time(pid: int) -> bool:
-    """End the real-time priority of all threads of a process.
-
-    Returns whether a thread had real-time priority; False if the process has ended.
-    """
-    threads = list_real_time_threads(pid)
-    for thread in threads:
-        with suppress(ProcessLookupError):
-            leave_real_time(thread)
-    return bool(threads)
+def leave_real_time() -> None:
+    """Give the calling thread the normal scheduling policy if it has real-time priority."""
+    if os.sched_getscheduler(0) == os.SCHED_RR:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -330,9 +330,6 @@ class Node:
     """Whether a graph omits the node if no other node reads its topics."""
     opens_devices: ClassVar[bool] = False
     """Whether the node opens devices, ports or files. A replay does not start such a node."""
-    late_modules: ClassVar[tuple[str, ...]] = ()
-    """The modules that the node imports only after its start, if parameters or messages require
-    them."""
 
     async def settle(self) -> None:
         """Wait until the work that handlers have started is finished.

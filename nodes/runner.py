@@ -35,7 +35,6 @@ from flexsheet.messages.topics import Delivery, Topic, find_topic
 from flexsheet.messages.types import Arming, EStop, HostStatus, Status
 from flexsheet.nodes import node_class
 from flexsheet.nodes.background import enter_real_time, leave_real_time
-from flexsheet.nodes.log_limit import RepeatLimiter
 from flexsheet.nodes.node import Node, PortCounts, Timer, find_parameters_type, find_timers
 from flexsheet.nodes.signals import handle_signals
 from flexsheet.nodes.stop_socket import StopSocket
@@ -453,7 +452,6 @@ def main(config_path: str) -> int:
     config = ProcessConfig.model_validate_json(Path(config_path).read_text())
     structlog.configure(
         processors=[
-            RepeatLimiter(),
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso"),
             structlog.processors.format_exc_info,

@@ -43,7 +43,6 @@ from flexsheet.messages.types import (
     ArmState,
     ClockOffset,
     Clocks,
-    CpuPressure,
     HostKey,
     HostStatus,
     NodeProcess,
@@ -185,10 +184,7 @@ def changed(probe: HostProbe, **values: Any) -> None:
 FAULTS: dict[str, tuple[Any, tuple[str, str, str], str]] = {
     "plan": (lambda v: changed(v["left"], plan_hash="else"), ("left", "plan", "failed"), "same"),
     "load": (
-        lambda v: changed(
-            v["left"],
-            cpu=CpuPressure(busy=True, wait_ratio=0.6, node="arm_left_bridge"),
-        ),
+        lambda v: changed(v["left"], load_ratio=1.6),
         ("left", "load", "warning"),
         "end other programs",
     ),

@@ -16,9 +16,8 @@ from flexsheet.launch.experiments.stroke import stroke_path
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import Run
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.types import CpuPressure, FingerPath, TwinFinger
+from flexsheet.messages.types import FingerPath, HostStatus, TwinFinger
 from flexsheet.nodes.twin.finger import FingerPathError
-from tests.test_busy import host
 from tests.test_planner import SCENE
 from tests.test_visible_lag import frame
 from tests.waiting import DEADLINE_S
@@ -123,15 +122,22 @@ async def test_frames_without_an_image_end_the_wait_at_last(
         await asyncio.wait_for(capture, DEADLINE_S)
 
 
+def host(load_ratio: float) -> HostStatus:
+    return HostStatus(
+        host="main", run="1", plan_hash="", code="", python="3.11", uptime_s=1.0,
+        disk_free_bytes=0, memory_free_bytes=0, nodes=(), missing_devices=(),
+        load_ratio=load_ratio,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(("busy", "kind"), [(True, OverloadedError), (False, ExperimentError)])
 async def test_a_timeout_on_an_overloaded_computer_names_the_overload(
     monkeypatch: pytest.MonkeyPatch, busy: bool, kind: type[ExperimentError]
 ) -> None:
     driver = make_driver(monkeypatch)
-    cpu = CpuPressure(busy=busy, wait_ratio=0.96, node="renderer")
-    receive(driver, "host", host(cpu=cpu))
+    receive(driver, "host", host(load_ratio=1.6 if busy else 1.4))
     with pytest.raises(ExperimentError, match="for the image") as failed:
         await driver.wait_for(lambda: False, "the image", 0.0)
     assert type(failed.value) is kind
-    assert ("renderer waits for a processor 96% of the time" in str(failed.value)) == busy
+    assert ("1.6 runnable processes per core" in str(failed.value)) == busy
     assert ("end other programs" in str(failed.value)) == busy

@@ -110,12 +110,7 @@ async def test_each_host_reports_its_state_and_its_nodes(tmp_path: Path) -> None
             ),
             "both hosts, and the restart",
         )
-        await until(
-            lambda: all(one.cpu is not None and one.cpu.node for one in newest.values()),
-            "how long nodes wait for a processor",
-        )
         subscriber.close()
-    assert {one.cpu.node for one in newest.values() if one.cpu} <= set(plan.nodes)
     assert {status.plan_hash for status in newest.values()} == {plan.hash}
     assert "other" in {node.name for node in newest["left"].nodes}
     assert newest["main"].disk_free_bytes > 0

@@ -400,7 +400,7 @@ def test_only_scenes_are_scene_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("type_name", "remedy"),
     [
-        ("no.such:Thing", "PYTHONPATH=FOLDER before the command, where FOLDER contains no/such.py"),
+        ("no.such:Thing", "PYTHONPATH=FOLDER before the command, where FOLDER contains the module"),
         ("tests.launch_nodes:Thing", "define the class Thing in tests.launch_nodes"),
     ],
 )

@@ -28,12 +28,9 @@ from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import priority, runs, supervisor
-from flexsheet.launch.running.cpu import CpuMeter, CpuWatch
-from flexsheet.launch.running.priority import find_real_time_priority, min_nice_step
-from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
+from flexsheet.launch.running.priority import permitted_nice, permitted_real_time
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
 from flexsheet.messages.bag import BagReader
-from flexsheet.messages.types import CpuPressure
 from tests.waiting import DEADLINE_S, until, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -114,13 +111,13 @@ async def test_a_node_has_high_priority_if_the_user_may_raise_it(tmp_path: Path)
     plan = plan_of(tmp_path, beacon=beacon(nice=-7))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
-        least = min_nice_step()
+        given = permitted_nice(-7)
         pid = graph.pids["beacon"]
         own = os.getpriority(os.PRIO_PROCESS, 0)
-        assert psutil.Process(pid).nice() == own + max(-7, least)
-        assert session_niceness(pid) in (None, own + max(-7, least))
+        assert psutil.Process(pid).nice() == own + given
+        assert session_niceness(pid) in (None, own + given)
         log = (graph.run.logs / "launch.log").read_text()
-        assert ("may not set the `nice`" in log) is (least > -7)
+        assert ("may not set the `nice`" in log) is (given == 0)
 
 
 async def test_a_ready_node_has_its_real_time_priority_if_the_user_may_set_it(
@@ -129,7 +126,7 @@ async def test_a_ready_node_has_its_real_time_priority_if_the_user_may_set_it(
     plan = plan_of(tmp_path, beacon=beacon(realtime_priority=7), listener=LISTENER)
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
-        granted = find_real_time_priority(7) is not None
+        granted = permitted_real_time(7) is not None
         pid = graph.pids["beacon"]
         policies = {os.sched_getscheduler(int(one)) for one in os.listdir(f"/proc/{pid}/task")}
         assert policies == {os.SCHED_RR if granted else os.SCHED_OTHER}
@@ -138,34 +135,6 @@ async def test_a_ready_node_has_its_real_time_priority_if_the_user_may_set_it(
         log = (graph.run.logs / "launch.log").read_text()
         permitted = priority._may_set_real_time(7)
         assert ("may not set the `nice` or `realtime_priority`" in log) is not permitted
-
-
-def test_a_used_port_names_the_options_of_both_nodes() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        settings = [f"twin_arms.left_port={port}", f"arm_left_bridge.port={port}"]
-        plan = load_graph(ROOT / "launch" / "demo.yaml", settings=settings)
-        with pytest.raises(BadInputError) as error:
-            supervisor._check_ports(plan, None)
-    options = "--set twin_arms.left_port=PORT --set arm_left_bridge.port=PORT"
-    assert f"port {port} of 127.0.0.1, for twin_arms, is in use; stop the other" in str(error.value)
-    assert options in str(error.value)
-
-
-def test_a_port_used_by_a_running_graph_names_the_graph(runs_root: Path) -> None:
-    """An option of the command that sets the port replaces --set."""
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        settings = [f"console.page_port={taken.getsockname()[1]}"]
-        plan = load_graph(ROOT / "launch" / "demo.yaml", settings=settings, console=True)
-        starting, run = runs.create_run(), runs.create_run()
-        run.plan_file.write_text(plan.model_dump_json())
-        with pytest.raises(BadInputError) as error:
-            supervisor._check_ports(plan, None, {"console.page_port": "--port PORT"})
-    assert starting.is_alive()
-    text = str(error.value)
-    assert f"in use by the running graph of {plan.launch_file}; " in text
-    assert f"stop it: flexsheet stop --run {run.directory}, or choose another port: --p" in text
-    assert "--set" not in text
 
 
 def test_the_processes_find_node_classes_beside_the_script(
@@ -178,55 +147,6 @@ def test_the_processes_find_node_classes_beside_the_script(
     assert supervisor._own_module_folders(["own:Guard"]) == [str(tmp_path)]
     assert supervisor._own_module_folders(["package.guard:Guard"]) == [str(tmp_path)]
     assert supervisor._own_module_folders(["planner", "elsewhere:Guard"]) == []
-
-
-async def test_real_time_is_withdrawn_step_by_step_while_a_node_gets_no_processor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Checked at run time, because an earlier test of this process may have raised its niceness.
-    if priority.find_real_time_priority(7) is None:
-        pytest.skip("the user, or a positive niceness of this process, permits no real time")
-    starved = CpuPressure(busy=True, wait_ratio=0.9, node="listener", programs=())
-    all_cores = float(os.cpu_count() or 1)
-    pressure, used_cores = starved.model_copy(update={"wait_ratio": 0.5}), all_cores
-    measured: list[tuple[CpuPressure, float]] = []
-
-    def measure(*_: Any) -> float:
-        measured.append((pressure, used_cores))
-        return used_cores
-
-    monkeypatch.setattr(CpuWatch, "update", lambda *_, **__: pressure)
-    monkeypatch.setattr(CpuMeter, "measure_cores", measure)
-    plan = plan_of(
-        tmp_path,
-        beacon=beacon(realtime_priority=7),
-        image=beacon(realtime_priority=3, topics={"twin__finger": None}),
-        listener=LISTENER,
-    )
-    policies: list[tuple[str, int]] = []
-
-    def report(_: str, line: str) -> None:
-        if "now without real-time priority" in line:
-            policies.append((line, os.sched_getscheduler(graph.pids["beacon"])))
-
-    async with RunningGraph(plan, report=report) as graph:
-        await graph.wait_ready()
-        pids = graph.pids["beacon"], graph.pids["image"]
-        await until(
-            lambda: {os.sched_getscheduler(pid) for pid in pids} == {os.SCHED_RR}, "real time"
-        )
-        await until(lambda: len(measured) > 1, "two measurements")
-        pressure, used_cores, before = starved, 0.1, len(measured)
-        await until(lambda: len(measured) > before + 1, "two measurements")
-        assert not policies, "the node waits for other programs"
-        assert os.sched_getscheduler(pids[0]) == os.SCHED_RR
-        used_cores = all_cores
-        await until(lambda: len(policies) == 2, "two reports")
-        (first, policy), (second, _) = policies
-        assert "real-time priority: image;" in first
-        assert policy == os.SCHED_RR, "the higher priority is withdrawn later"
-        assert "real-time priority: beacon;" in second
-        assert {os.sched_getscheduler(pid) for pid in pids} == {os.SCHED_OTHER}
 
 
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:
@@ -359,21 +279,6 @@ async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_ro
     assert_nothing_left(runs_root)
 
 
-async def test_a_node_that_waits_for_a_processor_may_start_late(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
-    monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
-    restart = {"policy": "never"}
-    late = beacon(parameters={"ready_after_s": 2.0}, start_deadline_s=0.3, restart=restart)
-    printed: list[str] = []
-    plan = plan_of(tmp_path, beacon=late)
-    async with RunningGraph(plan, report=lambda node, line: printed.append(line)) as graph:
-        await graph.wait_ready(DEADLINE_S)
-        assert graph.restarts == {"beacon": 0}
-    assert sum("beacon is not ready yet: it waited" in line for line in printed) == 1
-
-
 @pytest.mark.alone
 async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -407,72 +312,6 @@ def any_has(lines: list[str], words: str) -> bool:
 
 
 @pytest.mark.alone
-async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The process is suspended, with the measurements of one that waits for a processor."""
-    starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
-    monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
-    plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
-    printed: list[str] = []
-    async with RunningGraph(plan, report=lambda node, line: printed.append(line)) as graph:
-        await graph.wait_ready(DEADLINE_S)
-        graph.kill("beacon", signal.SIGSTOP)
-        starved_once = partial(any_has, printed, "beacon sends no heartbeat but does not hang")
-        await asyncio.to_thread(wait_until, starved_once, "it to be reported")
-        # As long again: it is reported once.
-        await asyncio.sleep(2.5)
-        graph.kill("beacon", signal.SIGCONT)
-        assert graph.restarts == graph.hangs == {"beacon": 0}
-    assert sum("sends no heartbeat" in line for line in printed) == 1
-
-
-def test_the_kernel_counts_how_long_processes_wait_for_a_processor() -> None:
-    processor = min(os.sched_getaffinity(0))
-    code = f"import os; os.sched_setaffinity(0, {{{processor}}})\nwhile True: pass"
-    spinning = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(2)]
-    try:
-        if ProcessorTime.read(os.getpid()) is None:
-            pytest.skip("this kernel keeps no statistics of its scheduler")
-
-        def waited() -> bool:
-            found = [ProcessorTime.read(process.pid) for process in spinning]
-            return all(one and one.state == "R" and one.wait_s > 0.1 < one.run_s for one in found)
-
-        wait_until(waited, "both to run and to wait")
-    finally:
-        for process in spinning:
-            process.kill()
-            process.wait()
-    assert ProcessorTime.read(spinning[0].pid) is None
-
-
-@pytest.mark.parametrize(
-    ("before", "now", "starved"),
-    [
-        ((1.0, 5.0, "S"), (1.1, 5.0, "S"), 0.0),
-        ((1.0, 5.0, "S"), (1.0, 5.0, "T"), 0.0),
-        ((1.0, 5.0, "S"), (1.5, 5.0, "R"), 0.0),
-        ((1.0, 5.0, "S"), (1.1, 5.3, "S"), 0.3),
-        ((1.0, 5.0, "R"), (1.1, 5.0, "R"), 0.4),
-        ((1.0, 5.0, "R"), (1.0, 9.0, "S"), 0.5),
-        (None, (1.0, 9.0, "S"), 0.0),
-        ((1.0, 5.0, "R"), None, 0.0),
-    ],
-)
-def test_what_counts_as_starved_in_half_a_second(
-    before: tuple[float, float, str] | None,
-    now: tuple[float, float, str] | None,
-    starved: float,
-) -> None:
-    """The cases are asleep, suspended, in an endless loop, and partly or always waiting for a
-    processor."""
-    earlier = None if before is None else ProcessorTime(*before)
-    later = None if now is None else ProcessorTime(*now)
-    assert compute_starved_s(earlier, later, 0.5) == pytest.approx(starved)
-
-
-@pytest.mark.alone
 async def test_silence_that_the_launcher_itself_was_absent_for_is_no_hang(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
     async with RunningGraph(plan) as graph:
@@ -499,8 +338,8 @@ async def test_a_node_that_ignores_signals_is_killed_with_its_children(
     plan = plan_of(tmp_path, beacon=beacon(parameters={"unreachable": True, "with_child": True}))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(DEADLINE_S)
-        # The node, its child process, and the fork server.
-        assert len(processes_of(graph.run.id)) == 3
+        # The node and its child process.
+        assert len(processes_of(graph.run.id)) == 2
     assert graph.exit_codes == {"beacon": -signal.SIGKILL}
     wait_until(lambda: not processes_of(graph.run.id), "the killed child to be gone")
     assert_nothing_left(runs_root)
@@ -732,8 +571,8 @@ def test_a_killed_launcher_leaves_no_node_behind(
     process = start_command(started, "launch", str(write(tmp_path, nodes)))
     wait_for_words(process, "are ready")
     (run,) = runs.list_live_runs()
-    # Three nodes, a child process, and the fork server.
-    assert len(processes_of(run.id)) == 5
+    # Three nodes and a child process.
+    assert len(processes_of(run.id)) == 4
     process.kill()
     process.communicate(timeout=DEADLINE_S)
     wait_until(lambda: len(processes_of(run.id)) <= 2, "the nodes that listen to end")

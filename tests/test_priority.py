@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.launch.running import child, priority
+from flexsheet.launch.running import child
 from flexsheet.launch.running.priority import (
     MIN_NICE,
     describe_priority_problem,
-    find_real_time_priority,
-    min_nice_step,
+    permitted_nice,
+    permitted_real_time,
 )
 from flexsheet.nodes import background
 
@@ -21,49 +21,69 @@ ROOT = Path(__file__).resolve().parent.parent
 DEMO = load_graph(ROOT / "launch" / "demo.yaml")
 
 
-def allow(monkeypatch: pytest.MonkeyPatch, *, capable: bool, limit: int) -> None:
-    """Set whether the user has the capability, and the soft limit of niceness.
+@pytest.fixture
+def own(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Replace the niceness of this process by the only element of the list."""
+    own = [0]
+    monkeypatch.setattr(os, "getpriority", lambda which, who: own[0])
+    return own
 
-    Real-time priorities are permitted.
-    """
-    monkeypatch.setattr(priority, "_has_cap_sys_nice", lambda: capable)
-    monkeypatch.setattr(priority, "_may_set_real_time", lambda wanted: True)
-    monkeypatch.setattr(priority.resource, "getrlimit", lambda which: (limit, limit))
-    monkeypatch.setattr(os, "getpriority", lambda which, who: 0)
+
+def permit(monkeypatch: pytest.MonkeyPatch, *, nice: int = MIN_NICE, real_time: int = 99) -> None:
+    """Set the lowest niceness and the highest real-time priority that the user may set."""
+
+    def setpriority(which: int, who: int, niceness: int) -> None:
+        if niceness < nice:
+            raise PermissionError
+
+    def sched_setscheduler(thread: int, policy: int, given: os.sched_param) -> None:
+        if given.sched_priority > real_time:
+            raise PermissionError
+
+    monkeypatch.setattr(os, "setpriority", setpriority)
+    monkeypatch.setattr(os, "sched_setscheduler", sched_setscheduler)
 
 
 @pytest.mark.parametrize(
-    ("capable", "limit", "least"), [(True, 0, MIN_NICE), (False, 0, 0), (False, 25, -5)]
+    ("launcher", "least", "step", "given"),
+    [
+        (0, MIN_NICE, -10, -10),
+        (0, 0, -10, 0),
+        (0, -5, -5, -5),
+        (5, 0, -5, -5),
+        (0, 0, 7, 7),
+        (-15, MIN_NICE, -10, -10),
+    ],
 )
-def test_capability_and_limit_allow_precedence(
-    monkeypatch: pytest.MonkeyPatch, capable: bool, limit: int, least: int
+def test_a_niceness_that_is_not_permitted_is_not_set(
+    *,
+    monkeypatch: pytest.MonkeyPatch,
+    own: list[int],
+    launcher: int,
+    least: int,
+    step: int,
+    given: int,
 ) -> None:
-    allow(monkeypatch, capable=capable, limit=limit)
-    assert min_nice_step() == least
-
-
-def test_a_nice_launcher_allows_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    allow(monkeypatch, capable=False, limit=20)
-    monkeypatch.setattr(os, "getpriority", lambda which, who: 5)
-    assert min_nice_step() == -5
+    permit(monkeypatch, nice=least)
+    own[0] = launcher
+    assert permitted_nice(step) == given
 
 
 def test_nodes_of_a_launcher_with_their_priority_lack_nothing(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, own: list[int]
 ) -> None:
-    allow(monkeypatch, capable=False, limit=0)
-    own = min(node.nice for node in DEMO.nodes.values())
-    monkeypatch.setattr(os, "getpriority", lambda which, who: own)
+    permit(monkeypatch, nice=0)
+    own[0] = min(node.nice for node in DEMO.nodes.values())
     assert describe_priority_problem(list(DEMO.nodes.values())) is None
 
 
 def test_a_missing_permission_for_priority_is_reported_once(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, own: list[int]
 ) -> None:
     nodes = list(DEMO.nodes.values())
-    allow(monkeypatch, capable=True, limit=0)
+    permit(monkeypatch)
     assert describe_priority_problem(nodes) is None
-    allow(monkeypatch, capable=False, limit=0)
+    permit(monkeypatch, nice=0)
     problem = describe_priority_problem(nodes)
     assert problem is not None
     assert "arm_left_bridge" in problem
@@ -71,9 +91,10 @@ def test_a_missing_permission_for_priority_is_reported_once(
     assert "\n" not in problem
 
 
-def test_a_missing_permission_for_real_time_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    allow(monkeypatch, capable=True, limit=0)
-    monkeypatch.setattr(priority, "_may_set_real_time", lambda wanted: False)
+def test_a_missing_permission_for_real_time_is_reported(
+    monkeypatch: pytest.MonkeyPatch, own: list[int]
+) -> None:
+    permit(monkeypatch, real_time=0)
     nodes = load_graph(ROOT / "launch" / "lab.yaml").nodes
     problem = describe_priority_problem(list(nodes.values()))
     assert problem is not None
@@ -82,31 +103,23 @@ def test_a_missing_permission_for_real_time_is_reported(monkeypatch: pytest.Monk
 
 
 def test_real_time_needs_permission_and_a_launcher_without_positive_niceness(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, own: list[int]
 ) -> None:
-    allow(monkeypatch, capable=True, limit=0)
-    assert find_real_time_priority(10) == 10
-    assert find_real_time_priority(None) is None
-    monkeypatch.setattr(os, "getpriority", lambda which, who: 5)
-    assert find_real_time_priority(10) is None
-    allow(monkeypatch, capable=True, limit=0)
-    monkeypatch.setattr(priority, "_may_set_real_time", lambda wanted: False)
-    assert find_real_time_priority(10) is None
-
-
-def test_a_user_without_permission_may_not_set_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError
-
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert not priority._may_set_real_time(1)
+    permit(monkeypatch)
+    assert permitted_real_time(10) == 10
+    assert permitted_real_time(None) is None
+    permit(monkeypatch, real_time=9)
+    assert permitted_real_time(10) is None
+    permit(monkeypatch)
+    own[0] = 5
+    assert permitted_real_time(10) is None
 
 
 @pytest.mark.parametrize(("user", "remedy"), [(0, "CAP_SYS_NICE"), (1000, "start as root")])
 def test_root_is_not_advised_to_become_root(
-    monkeypatch: pytest.MonkeyPatch, user: int, remedy: str
+    monkeypatch: pytest.MonkeyPatch, own: list[int], user: int, remedy: str
 ) -> None:
-    allow(monkeypatch, capable=False, limit=0)
+    permit(monkeypatch, nice=0)
     monkeypatch.setattr(os, "geteuid", lambda: user)
     problem = describe_priority_problem(list(DEMO.nodes.values()))
     assert problem is not None
@@ -129,17 +142,14 @@ def test_a_session_of_a_nice_launcher_is_nice(
     assert autogroup.read_text() == written
 
 
-def test_in_the_demo_the_arms_come_first_and_the_image_before_other_programs() -> None:
+def test_in_the_demo_the_arms_come_first() -> None:
     chain = {
         "twin_finger", "camera", "triangulator", "planner", "twin_arms", "arm_left_bridge",
         "arm_right_bridge",
     }  # fmt: skip
-    priorities = {name: node.realtime_priority for name, node in DEMO.nodes.items()}
-    assert {name for name, given in priorities.items() if given == 10} == chain
-    assert {name for name, given in priorities.items() if given == 5} == {"fem_solver", "renderer"}
-    assert set(priorities.values()) <= {None, 5, 10}
-    first = max(DEMO.nodes[name].nice for name in chain)
-    assert first < 0 <= min(node.nice for node in DEMO.nodes.values() if node.name not in chain)
+    for name, node in DEMO.nodes.items():
+        first = (-10, 10) if name in chain else (0, None)
+        assert (node.nice, node.realtime_priority) == first
 
 
 def test_simulated_arms_may_answer_late_and_then_nothing_else_stops_them() -> None:

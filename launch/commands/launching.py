@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -183,7 +183,6 @@ async def run_graph(
     duration_s: float | None,
     *,
     without: Collection[str] = (),
-    port_options: Mapping[str, str] | None = None,
     when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
     """Run a graph until a signal arrives, and return the exit code.
@@ -193,15 +192,12 @@ async def run_graph(
 
     duration_s: maximum time after all nodes are ready. If it is None, the time is not limited.
     without: names of nodes that are not started.
-    port_options: see `RunningGraph`.
     when_ready: function that is called when all nodes are ready.
     """
     from flexsheet.launch.running.supervisor import RunningGraph
 
     stop_requested = asyncio.Event()
-    graph = RunningGraph(
-        plan, host=host, without=without, report=_print_log_line, port_options=port_options
-    )
+    graph = RunningGraph(plan, host=host, without=without, report=_print_log_line)
 
     signals = 0
 

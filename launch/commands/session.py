@@ -417,7 +417,7 @@ def run_node(
 
 
 async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | None) -> int:
-    from flexsheet.launch.running.supervisor import node_config
+    from flexsheet.launch.running.node_config import node_config
 
     if (run.directory / f"{name}.status").exists():
         raise CommandError(

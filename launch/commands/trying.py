@@ -66,6 +66,4 @@ def try_it(
         if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)
 
-    own = {"console.page_port": "--port PORT"}
-    work = run_graph(plan, None, duration, port_options=own, when_ready=ready)
-    raise typer.Exit(asyncio.run(work))
+    raise typer.Exit(asyncio.run(run_graph(plan, None, duration, when_ready=ready)))

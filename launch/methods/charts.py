@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from flexsheet.launch.methods.results import machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
 from flexsheet.launch.plans.documents import did_you_mean
-from flexsheet.launch.running.code_state import read_git_state
+from flexsheet.launch.running.commit import read_commit
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
@@ -74,8 +74,7 @@ def load_family(path: str) -> Family:
 
 def git_commit() -> str | None:
     """Return the git commit of this code, or None if it is unknown."""
-    commit: str | None = json.loads(read_git_state(ROOT))["commit"]
-    return commit
+    return read_commit()
 
 
 def measure_family(
@@ -137,7 +136,7 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
         "sweep_key": family.sweep_key,
         "machine": machine_name(),
         "load": os.getloadavg()[0],
-        "code": json.loads(read_git_state(ROOT)),
+        "code": {"commit": read_commit()},
         "points": [asdict(point) for point in points],
         "front": pareto_front(points),
     }

@@ -53,7 +53,6 @@ from flexsheet.launch.plans.resolve_nodes import (
     check_device_hosts,
     collect_entries,
     dump_parameters,
-    leave_time_for_browsers,
     resolve_entry,
 )
 from flexsheet.launch.plans.routing import (
@@ -112,7 +111,6 @@ def load_graph(
     truth = _load_apparatus(apparatus, scene, scene_file, document)
     give_apparatus(entries, truth, document)
     entries, omitted = omit_unneeded(entries, scene, needed, spec.external_topics)
-    leave_time_for_browsers(entries)
     writers = list_writers(
         spec,
         entries,

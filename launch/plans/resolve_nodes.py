@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,13 @@ from flexsheet.messages.marker_calibration import load_marker_calibration, refus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
 from flexsheet.messages.topics import TOPICS, Topic
-from flexsheet.nodes import NODES, NodeImportError, NodeRole, UnknownNodeError, node_class
+from flexsheet.nodes import NODES, NodeImportError, UnknownNodeError, node_class
 from flexsheet.nodes.node import (
     Node,
     NodeParameters,
     Port,
     find_parameters_type,
     find_ports,
-    find_role,
     find_timers,
     find_unmatched_handlers,
     further_port,
@@ -144,22 +143,6 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
     return NodeEntry(clock_node(host), node_spec, ("clocks",))
 
 
-def leave_time_for_browsers(entries: Sequence[NodeEntry]) -> None:
-    """Withdraw the real-time priority of nodes with positive niceness on hosts with a console.
-
-    Otherwise, a browser that draws the console's page without a graphics card gets too little
-    processor time.
-    """
-    hosts = {
-        entry.spec.host
-        for entry in entries
-        if entry.type is not None and find_role(entry.type) is NodeRole.CONSOLE
-    }
-    for entry in entries:
-        if entry.spec.host in hosts and entry.spec.nice > 0:
-            entry.spec = entry.spec.model_copy(update={"realtime_priority": None})
-
-
 def resolve_entry(entry: NodeEntry, document: Document) -> None:
     """Find the node's class, connect its ports, and check its parameters.
 
@@ -175,8 +158,7 @@ def resolve_entry(entry: NodeEntry, document: Document) -> None:
         )
         return
     except NodeImportError as error:
-        text = f'"{type_name}" cannot be imported: {error.problem}'
-        document.report((*key, "type"), text, error.advice)
+        document.report((*key, "type"), str(error))
         return
     if not (isinstance(class_, type) and issubclass(class_, Node)):
         document.report(

@@ -21,20 +21,16 @@ import zmq
 
 from flexsheet.launch.plans.hosts import clock_node, launcher_on
 from flexsheet.launch.plans.plan_model import ArmingMode, ResolvedGraph, ResolvedNode, tools_on
-from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuMeter, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
-from flexsheet.launch.running.priority import list_denied
 from flexsheet.launch.running.runs import Run, local_endpoints, local_sources
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Handler, Publisher, Source, Subscriber
-from flexsheet.messages.busy import describe_busy, describe_busy_remedy, is_busy
 from flexsheet.messages.clock import Clock, SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import (
     ArmState,
-    CpuPressure,
     EStop,
     HostKey,
     HostStatus,
@@ -42,24 +38,10 @@ from flexsheet.messages.types import (
     NodeProcess,
 )
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.background import end_real_time, list_real_time_threads
 from flexsheet.nodes.node import Output, PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
-BUSY_REPORT_PERIOD_S = 60.0
-STARVED_WAIT_RATIO = 0.8
-"""The minimum fraction of time without a processor at which real-time priorities are withdrawn."""
-
-STARVED_FOR_S = 1.5
-"""The minimum time (s) for which a node is watched before real-time priorities are withdrawn."""
-
-MAX_REAL_TIME_FRACTION = 0.85
-"""The maximum fraction of all cores that real-time nodes can use while another node waits.
-
-If they use less, the other node waits for programs without real-time priority.
-"""
-
 REASON_LENGTH = 1000
 """The maximum length (characters) of an e-stop's reason, so that it fits into every message."""
 
@@ -68,9 +50,6 @@ RESET_WITHIN_S = 5.0
 
 ARMS = ("arm_left", "arm_right")
 
-Processes = Callable[[], tuple[NodeProcess, ...]]
-Pids = Callable[[], dict[str, int]]
-
 
 class HostAgent:
     """A part of the launcher that publishes the status of its host and latches e-stops.
@@ -78,7 +57,7 @@ class HostAgent:
     The agent works between the calls of `start` and `close`.
 
     code: git commit of the running code, which is a part of the published status.
-    pids: function that returns the process ids of the running nodes by node name.
+    processes: function that returns the states of the processes of the host's nodes.
     """
 
     def __init__(
@@ -88,16 +67,12 @@ class HostAgent:
         *,
         run: Run,
         code: str,
-        processes: Processes,
-        pids: Pids,
+        processes: Callable[[], tuple[NodeProcess, ...]],
         keys: KeyRing | None,
         on_problem: Callable[[str], None],
     ) -> None:
         self._plan, self._host, self._run, self._code = plan, host, run, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
-        self._pids, self._cpu, self._starvation = pids, CpuWatch(), CpuWatch(min_s=STARVED_FOR_S)
-        self._real_time_cpu = CpuMeter()
-        self._busy_statuses, self._busy_reported_ns = 0, 0
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
         # Launchers repeat the e-stop, so a restarted launcher gets it from the other launchers.
@@ -128,11 +103,6 @@ class HostAgent:
         self._status_error = ""
         nodes = plan.nodes_on(host)
         self._devices, self._folder = list_device_files(nodes), find_recording_folder(nodes)
-        self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
-        self._nice_denied = bool(list_denied(nodes))
-        self._real_time = {
-            node.name: node.realtime_priority for node in nodes if node.realtime_priority
-        }
 
     def start(self) -> None:
         """Subscribe to e-stops and start to publish. An event loop must be running."""
@@ -287,10 +257,7 @@ class HostAgent:
     async def _publish_loop(self) -> None:
         while True:
             try:
-                status = self._status()
-                self._publish("host", status)
-                self._report_busy(status)
-                self._limit_real_time()
+                self._publish("host", self._status())
             except OSError as error:
                 problem = f"the status of this host cannot be read: {error}"
                 if problem != self._status_error:
@@ -300,72 +267,8 @@ class HostAgent:
                 self._update_file()
             await asyncio.sleep(PERIOD_S)
 
-    def _report_busy(self, status: HostStatus) -> None:
-        """Log that the processor is overloaded, at most once per BUSY_REPORT_PERIOD_S.
-
-        The log entry is made from the second consecutive status with an overload. The first such
-        status does not yet list the programs that use the processor.
-        """
-        now_ns = self._clock.now_ns()
-        self._busy_statuses = self._busy_statuses + 1 if is_busy(status) else 0
-        if (
-            self._busy_statuses == 2
-            and now_ns >= self._busy_reported_ns + BUSY_REPORT_PERIOD_S * 1e9
-        ):
-            self._busy_reported_ns = now_ns
-            remedy = describe_busy_remedy(nice_denied=status.nice_denied)
-            self._on_problem(f"{describe_busy(status)}; {remedy}")
-
-    def _limit_real_time(self) -> None:
-        """Withdraw the lowest real-time priority of this graph's nodes if they starve another node.
-
-        If the node still waits afterwards, a later call withdraws the next priority. All running
-        nodes without real-time priority are checked, including those of high niceness.
-        """
-        pids = self._pids()
-        threads = {pid: list_real_time_threads(pid) for pid in set(pids.values())}
-        cores = self._real_time_cpu.measure_cores(threads)
-        ready = {one.name for one in self._processes() if one.state == "ready"}
-        pressure = self._starvation.update(
-            {name: pids[name] for name in ready & pids.keys() if not threads[pids[name]]}
-        )
-        if pressure is None or pressure.wait_ratio < STARVED_WAIT_RATIO:
-            return
-        if cores < MAX_REAL_TIME_FRACTION * len(os.sched_getaffinity(0)):
-            return
-        for level in sorted(set(self._real_time.values())):
-            names = [name for name in pids if self._real_time.get(name) == level]
-            ended = {pid for pid in {pids[name] for name in names} if end_real_time(pid)}
-            changed = [name for name in names if pids[name] in ended]
-            if changed:
-                self._starvation = CpuWatch(min_s=STARVED_FOR_S)
-                self._on_problem(
-                    f"{pressure.node} waited for a processor {pressure.wait_ratio:.0%} of the time "
-                    f"while nodes with real-time priority used {cores:.1f} cores; now without "
-                    f"real-time priority: {', '.join(sorted(changed))}; lower their rates, or run "
-                    "fewer nodes on this computer"
-                )
-                return
-
-    def _measure_cpu(self, watched: dict[str, int], pids: dict[str, int]) -> CpuPressure | None:
-        """Return how long nodes wait for a processor, or None if the kernel does not count it.
-
-        Until the first nodes have been watched for a second, the waiting time is stated as 0.
-        """
-        found = self._cpu.update(watched, pids)
-        if found is None and self._cpu.can_measure:
-            return CpuPressure(busy=False, wait_ratio=0.0, node="")
-        return found
-
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
-        processes, pids = self._processes(), self._pids()
-        # A starting node uses the processor for seconds but delays no messages, so it is ignored.
-        watched = {
-            one.name: pids[one.name]
-            for one in processes
-            if one.state == "ready" and one.name in pids and one.name not in self._background
-        }
         return HostStatus(
             host=self._host,
             run=self._run.id,
@@ -376,7 +279,7 @@ class HostAgent:
             load_ratio=os.getloadavg()[0] / (os.cpu_count() or 1),
             disk_free_bytes=disk.f_bavail * disk.f_frsize,
             memory_free_bytes=psutil.virtual_memory().available,
-            nodes=processes,
+            nodes=self._processes(),
             omitted=tuple(
                 NodeOmission(name=one.name, reason=one.reason.value)
                 for one in self._plan.omitted
@@ -388,8 +291,6 @@ class HostAgent:
             if self._keys is None
             else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
             estop=None if self._latched is None else self._latched.reason,
-            cpu=self._measure_cpu(watched, pids),
-            nice_denied=self._nice_denied,
         )
 
 

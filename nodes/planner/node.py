@@ -57,7 +57,6 @@ class Planner(Node):
     watched_inputs: ClassVar[frozenset[str]] = frozenset({"fingertip"})
     ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"max_age_s"})
-    late_modules: ClassVar[tuple[str, ...]] = ("scipy.interpolate",)
     parameters: PlannerParameters
     scene: Input[Scene]
     fingertip: Input[Fingertip]

@@ -87,7 +87,6 @@ class Triangulator(Node):
     watched_inputs: ClassVar[frozenset[str]] = frozenset({"stereo"})
     ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"track_timeout_s"})
-    late_modules: ClassVar[tuple[str, ...]] = ("scipy.special",)
     parameters: TriangulatorParameters
     scene: Input[Scene]
     stereo: Input[StereoPair]

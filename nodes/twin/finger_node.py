@@ -82,7 +82,6 @@ class TwinFingerNode(Node):
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"twin__arms"})
-    late_modules: ClassVar[tuple[str, ...]] = ("scipy.special",)
     parameters: TwinFingerParameters
     scene: Input[Scene]
     twin__arms: Input[TwinArms]

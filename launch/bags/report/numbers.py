@@ -10,7 +10,7 @@ import numpy as np
 from flexsheet.launch.bags.report.series import Maxima, Spread, States
 from flexsheet.launch.bags.report.session import Arm, HostLoad, NodeSummary, Session
 from flexsheet.launch.bags.report.strokes import FingerRun
-from flexsheet.messages.busy import describe_busy, describe_busy_remedy
+from flexsheet.messages.busy import BUSY_REMEDY, describe_busy
 from flexsheet.messages.methods import Methods
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
@@ -111,7 +111,7 @@ def _load(load: HostLoad) -> dict[str, Any]:
     return {
         "busy_fraction": load.busy / load.reports,
         "busy_at_worst": "" if worst is None else describe_busy(worst),
-        "busy_remedy": "" if worst is None else describe_busy_remedy(nice_denied=worst.nice_denied),
+        "busy_remedy": "" if worst is None else BUSY_REMEDY,
     }
 
 

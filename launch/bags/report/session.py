@@ -164,12 +164,8 @@ class HostLoad:
         self.reports += 1
         if is_busy(host):
             self.busy += 1
-            if self.worst is None or _pressure(host) > _pressure(self.worst):
+            if self.worst is None or host.load_ratio > self.worst.load_ratio:
                 self.worst = host
-
-
-def _pressure(host: HostStatus) -> float:
-    return host.load_ratio if host.cpu is None else host.cpu.wait_ratio
 
 
 @dataclass(slots=True)
