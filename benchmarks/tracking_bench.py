@@ -12,7 +12,7 @@ import numpy as np
 
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Topic
@@ -173,7 +173,7 @@ def twin_camera(
 
 def calibration_covariance(scene: Scene, file: Path = CALIBRATION_FILE) -> Floats:
     """Return the covariance (3, 3) of fingertips that the calibration's uncertainty causes, m^2."""
-    uncertainty = load_calibration(file).uncertainty
+    uncertainty = StereoCalibration.load(file).uncertainty
     if uncertainty is None:
         raise ValueError(f"{file}: uncertainty: null; calibrate again to estimate it")
     across = 0.5 * uncertainty.lateral_std_m**2

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from flexsheet.messages.calibration import Board, Covariance
-from flexsheet.messages.calibration_file import read_calibration, write_calibration
+from flexsheet.messages.calibration_file import CalibrationFile
 from flexsheet.messages.scene import NonNegative, Part, Pose
 
 
@@ -63,12 +62,13 @@ class ArmBase(Part):
     poses: tuple[ArmPoseFit, ...]
 
 
-class ArmsCalibration(Part):
+class ArmsCalibration(CalibrationFile):
     """The calibrated poses of the bases of both arms.
 
     If an arm was not calibrated, its field is null.
     """
 
+    command: ClassVar[str] = "flexsheet calibrate arms"
     version: Literal[1] = 1
     date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
@@ -77,22 +77,3 @@ class ArmsCalibration(Part):
     board: Board
     left: ArmBase | None = None
     right: ArmBase | None = None
-
-
-def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the calibration of the arm bases to a YAML file.
-
-    comment: comment line at the start of the file; empty if there is no comment.
-
-    Raises FileWriteError if the file cannot be written.
-    """
-    title = f"Bases of the arms of scene {calibration.scene}, {calibration.date}."
-    write_calibration(calibration, path, title=title, comment=comment)
-
-
-def load_arms_calibration(path: Path) -> ArmsCalibration:
-    """Read the calibration of the arm bases from a YAML file.
-
-    Raises CalibrationFileError if the file is invalid.
-    """
-    return read_calibration(ArmsCalibration, path, command="flexsheet calibrate arms")

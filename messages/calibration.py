@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +10,8 @@ from pydantic import Field
 
 from flexsheet.messages.arrays import ArraySpec, Transform
 from flexsheet.messages.calibration_file import (
+    CalibrationFile,
     CalibrationMismatchError,
-    read_calibration,
-    write_calibration,
 )
 from flexsheet.messages.scene import Lens, NonNegative, Part, Positive, StereoCamera
 
@@ -87,9 +85,10 @@ class Uncertainty(Part):
     covariance: Covariance
 
 
-class StereoCalibration(Part):
+class StereoCalibration(CalibrationFile):
     """The calibration of a stereo camera: both lenses and the transform between them."""
 
+    command: ClassVar[str] = "flexsheet calibrate stereo"
     version: Literal[2] = 2
     device: str
     date: str = Field(description="time of the calibration, ISO 8601, UTC")
@@ -130,22 +129,3 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
             f"the scene's camera delivers {expected[0]}x{expected[1]} px: calibrate at "
             "this image size"
         )
-
-
-def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
-    """Write a stereo calibration to a YAML file.
-
-    comment: comment line at the start of the file; empty if there is no comment.
-
-    Raises FileWriteError if the file cannot be written.
-    """
-    title = f"Stereo calibration of {calibration.device}, {calibration.date}."
-    write_calibration(calibration, path, title=title, comment=comment)
-
-
-def load_calibration(path: Path) -> StereoCalibration:
-    """Read a stereo calibration from a YAML file.
-
-    Raises CalibrationFileError if the file is invalid.
-    """
-    return read_calibration(StereoCalibration, path, command="flexsheet calibrate stereo")

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from flexsheet.messages.calibration_file import (
+    CalibrationFile,
     CalibrationMismatchError,
-    read_calibration,
-    write_calibration,
 )
-from flexsheet.messages.scene import FingerLengths, NonNegative, Part, Scene
+from flexsheet.messages.scene import FingerLengths, NonNegative, Scene
 
 Triple = tuple[float, float, float]
 
 
-class MarkerCalibration(Part):
+class MarkerCalibration(CalibrationFile):
     """The calibrated position of the marker on a finger, with its uncertainty."""
 
+    command: ClassVar[str] = "flexsheet calibrate marker"
     version: Literal[1] = 1
     date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
@@ -55,24 +54,3 @@ def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
             f'scene: the marker was calibrated in the scene "{calibration.scene}", not in '
             f'"{scene.name}": use the file of this scene, or run `flexsheet calibrate marker`'
         )
-
-
-def save_marker_calibration(
-    calibration: MarkerCalibration, path: Path, *, comment: str = ""
-) -> None:
-    """Write a marker calibration to a YAML file.
-
-    comment: comment line at the start of the file; empty if there is no comment.
-
-    Raises FileWriteError if the file cannot be written.
-    """
-    title = f"Calibration of a finger's marker, {calibration.date}."
-    write_calibration(calibration, path, title=title, comment=comment)
-
-
-def load_marker_calibration(path: Path) -> MarkerCalibration:
-    """Read a marker calibration from a YAML file.
-
-    Raises CalibrationFileError if the file is invalid.
-    """
-    return read_calibration(MarkerCalibration, path, command="flexsheet calibrate marker")

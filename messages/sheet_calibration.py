@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +10,8 @@ from pydantic import Field
 
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.calibration_file import (
+    CalibrationFile,
     CalibrationMismatchError,
-    read_calibration,
-    write_calibration,
 )
 from flexsheet.messages.scene import NonNegative, Part, Positive, SheetSpec
 
@@ -54,13 +52,14 @@ class SheetTable(Part):
     ratios: Entries
 
 
-class SheetCalibration(Part):
+class SheetCalibration(CalibrationFile):
     """The calibration of a rubber sheet.
 
     The calibration contains the fitted parameters of the force model, and the range of the
     measurements.
     """
 
+    command: ClassVar[str] = "flexsheet calibrate sheet"
     version: Literal[1] = 1
     date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
@@ -114,22 +113,3 @@ def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
                 f"the calibrated sheet has {key} {measured:g}, but the scene's sheet.{key} is "
                 f"{expected:g}: use the file of this sheet, or calibrate this sheet"
             )
-
-
-def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
-    """Write a sheet calibration to a YAML file.
-
-    comment: comment line at the start of the file; empty if there is no comment.
-
-    Raises FileWriteError if the file cannot be written.
-    """
-    title = f"Calibration of a sheet, {calibration.date}."
-    write_calibration(calibration, path, title=title, comment=comment)
-
-
-def load_sheet_calibration(path: Path) -> SheetCalibration:
-    """Read a sheet calibration from a YAML file.
-
-    Raises CalibrationFileError if the file is invalid.
-    """
-    return read_calibration(SheetCalibration, path, command="flexsheet calibrate sheet")

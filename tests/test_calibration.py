@@ -27,8 +27,6 @@ from flexsheet.launch.calibration.uncertainty import compute_position_jacobian, 
 from flexsheet.messages.calibration import (
     Board,
     StereoCalibration,
-    load_calibration,
-    save_calibration,
 )
 from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.scene import Lens
@@ -244,8 +242,8 @@ def test_rigid_fit_recovers_a_moved_board(
 
 
 def test_file_round_trip_keeps_every_digit(tmp_path: Path, calibration: StereoCalibration) -> None:
-    save_calibration(calibration, tmp_path / "rig.yaml")
-    loaded = load_calibration(tmp_path / "rig.yaml")
+    calibration.save(tmp_path / "rig.yaml")
+    loaded = StereoCalibration.load(tmp_path / "rig.yaml")
     assert loaded.model_dump(mode="json") == calibration.model_dump(mode="json")
     assert [path.name for path in tmp_path.iterdir()] == ["rig.yaml"]
 
@@ -274,19 +272,19 @@ def test_a_spoilt_file_is_rejected(
     tmp_path: Path, calibration: StereoCalibration, corrupt: Callable[[str], str], printed: str
 ) -> None:
     path = tmp_path / "rig.yaml"
-    save_calibration(calibration, path)
+    calibration.save(path)
     path.write_text(corrupt(path.read_text()))
     with pytest.raises(CalibrationFileError, match=printed) as raised:
-        load_calibration(path)
+        StereoCalibration.load(path)
     assert str(path) in str(raised.value)
 
 
 def test_a_lens_file_needs_finite_numbers(tmp_path: Path, calibration: StereoCalibration) -> None:
     path = tmp_path / "rig.yaml"
-    save_calibration(calibration, path)
+    calibration.save(path)
     path.write_text(path.read_text().replace("fx_px: ", "fx_px: .nan #", 1))
     with pytest.raises(CalibrationFileError, match=r"left\.fx_px"):
-        load_calibration(path)
+        StereoCalibration.load(path)
     assert isinstance(calibration.left, Lens)
 
 

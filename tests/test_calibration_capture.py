@@ -38,7 +38,7 @@ from flexsheet.launch.calibration.stereo import calibrate_stereo
 from flexsheet.launch.commands.capture import coverage_view, write_pairs
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.messages.calibration import Board, load_calibration
+from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.messages.scene import Scene, StereoCamera
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.twin.board import TwinBoard
@@ -321,7 +321,7 @@ def test_the_twin_is_calibrated_by_the_command(
     assert result["pairs"] >= 8
     assert result["uncertainty"]["working_distance_mm"] == pytest.approx(503.6, abs=0.1)
     assert 0.01 < result["uncertainty"]["depth_std_mm"] < 2.0
-    calibration = load_calibration(output)
+    calibration = StereoCalibration.load(output)
     assert calibration.device == camera.device
     assert calibration.opencv_version == cv2.__version__
     assert "# flexsheet calibrate stereo --twin" in output.read_text()

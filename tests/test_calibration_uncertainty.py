@@ -30,7 +30,7 @@ from flexsheet.launch.calibration.uncertainty import (
     sample_working_plane,
 )
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
+from flexsheet.messages.calibration import Board, StereoCalibration, Uncertainty
 from flexsheet.messages.scene import Lens, Scene, StereoCamera
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.twin.board import TwinBoard
@@ -266,7 +266,7 @@ def test_fingertip_errors_agree_with_the_stated_uncertainty() -> None:
 
 
 def test_shipped_calibration_is_within_its_stated_uncertainty() -> None:
-    shipped = load_calibration(SHIPPED)
+    shipped = StereoCalibration.load(SHIPPED)
     assert shipped.uncertainty is not None
     true, measured = numbers_of(make_true_camera(scene_camera())), numbers_of(shipped)
     off = measured - true
@@ -282,7 +282,7 @@ def test_shipped_calibration_is_within_its_stated_uncertainty() -> None:
 @pytest.mark.long
 def test_the_twin_calibrated_again_agrees_with_the_shipped_file() -> None:
     """This calibration has fewer pairs, other poses and other noise."""
-    shipped = load_calibration(SHIPPED)
+    shipped = StereoCalibration.load(SHIPPED)
     assert shipped.uncertainty is not None
     distance_m = shipped.uncertainty.working_distance_m
     fit, again = calibrated(

@@ -49,7 +49,7 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_apparatus
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.marker_calibration import MarkerCalibration
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import ArmState
@@ -274,7 +274,7 @@ def test_the_reported_edges_yield_to_the_tension_of_the_sheet() -> None:
 def fit_tilted_marker() -> tuple[Apparatus, MarkerCalibration]:
     """Fit the marker offset of a finger that is tilted against its usual orientation."""
     given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010], finger_tilt_rad=[0.2, -0.15])
-    touches = simulate_touches(SCENE, given, calibration=load_calibration(OPTICS), seed=1)
+    touches = simulate_touches(SCENE, given, calibration=StereoCalibration.load(OPTICS), seed=1)
     return given, fit_marker(touches, SCENE, "twin")
 
 
@@ -612,7 +612,7 @@ def test_a_failed_stroke_says_that_finished_steps_are_kept(
 def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> None:
     """The reference draws fingertip errors without the evaluator: marker and timestamp."""
     covariance_m2 = 1e-8 * np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
-    optics = load_calibration(OPTICS)
+    optics = StereoCalibration.load(OPTICS)
     marker = fit_tilted_marker()[1].model_copy(
         update={"covariance_m2": tuple(map(tuple, covariance_m2.tolist()))}
     )

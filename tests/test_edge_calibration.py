@@ -22,7 +22,7 @@ from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import ArmsTruth, ArmTruth, CameraTruth, nominal_apparatus
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
@@ -34,7 +34,7 @@ from flexsheet.nodes.twin.tolerance_table import sample_apparatus
 
 LAUNCH = Path(__file__).resolve().parent.parent / "launch"
 SCENE = load_scene(LAUNCH / "scenes" / "cylinder.yaml")
-OPTICS = load_calibration(LAUNCH / "calibrations" / "twin-bumblebee.yaml")
+OPTICS = StereoCalibration.load(LAUNCH / "calibrations" / "twin-bumblebee.yaml")
 OFFSETS_RAD = (3e-4, -5e-4, 4e-4, 6e-4, -2e-4, 5e-4)
 COMPLIANCES_M_PER_N = {"left": 120e-6, "right": 40e-6}
 

@@ -20,12 +20,12 @@ from flexsheet.launch.calibration.eyes import (
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import nominal_apparatus
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Eyes
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = load_scene(ROOT / "launch" / "scenes" / "cylinder.yaml")
-OPTICS = load_calibration(ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml")
+OPTICS = StereoCalibration.load(ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml")
 TRUE = Eyes(centre_world_m=np.array([0.012, -0.008, 0.43]), interocular_m=0.061)
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.nodes.triangulator.benchmarks import noisy
 from flexsheet.nodes.triangulator.ellipse import integrate_ellipse
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
@@ -234,7 +234,7 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 6)
 def test_the_marker_of_an_apparatus_is_measured(profile: Profile, seed: int) -> None:
     """At most one of 50 image pairs is invalid, with and without an expected position."""
     scene = load_scene(LAUNCH / "scenes" / "cylinder.yaml")
-    calibration = load_calibration(LAUNCH / "calibrations" / "twin-bumblebee.yaml")
+    calibration = StereoCalibration.load(LAUNCH / "calibrations" / "twin-bumblebee.yaml")
     truth = sample_apparatus(scene, seed, profile=profile, calibrated=True)
     true_scene = apply_apparatus(scene, truth)
     camera = TwinCamera(

@@ -19,7 +19,7 @@ from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.messages.apparatus import Apparatus, SheetTruth
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.sheet_calibration import load_sheet_calibration
+from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Force
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
@@ -183,7 +183,7 @@ def test_calibrate_sheet_reads_a_bag(tmp_path: Path) -> None:
     assert outcome.exit_code == 0, outcome.output
     found = json.loads(outcome.stdout)["modulus_thickness_n_per_m"]["value"]
     assert found == pytest.approx(0.8 * EXPECTED, rel=0.05)
-    calibration = load_sheet_calibration(output)
+    calibration = SheetCalibration.load(output)
     assert make_force_model(SHEET, calibration) is not None
     (check,) = check_stiffness(SHEET, calibration)
     assert check.suspected

@@ -35,7 +35,7 @@ from flexsheet.launch.calibration.hand_eye import (
 )
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.arms_calibration import load_arms_calibration
+from flexsheet.messages.arms_calibration import ArmsCalibration
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.types import Side
@@ -423,7 +423,7 @@ def test_the_twins_arms_are_calibrated_from_images(flexsheet: Command, tmp_path:
         assert one["true_error_m"] < 4.0 * one["position_std_m"] < 0.002
         assert one["true_error_rad"] < 4.0 * one["rotation_std_rad"]
         assert one["moved_from_scene_m"] > 0.001
-    found = load_arms_calibration(output)
+    found = ArmsCalibration.load(output)
     assert found.left is not None
     # The copy is the scene but for the bases, comments and all.
     before, after = SCENE_FILE.read_text().splitlines(), copy.read_text().splitlines()
@@ -449,7 +449,7 @@ def test_one_arm_alone_from_a_folder(flexsheet: Command, tmp_path: Path) -> None
     assert code == 0, err
     assert re.search(r"^arms right poses used +8$", out, re.MULTILINE)
     assert re.search(r"^arms right world from base position +\S+, \S+, \S+ mm$", out, re.MULTILINE)
-    assert load_arms_calibration(tmp_path / "arms.yaml").left is None
+    assert ArmsCalibration.load(tmp_path / "arms.yaml").left is None
 
 
 def test_bad_input_to_the_command_is_named(flexsheet: Command, tmp_path: Path) -> None:
@@ -505,4 +505,4 @@ def test_a_bad_calibration_file_is_named(tmp_path: Path, text: str | None, words
     if text is not None:
         path.write_text(text)
     with pytest.raises(CalibrationFileError, match=words):
-        load_arms_calibration(path)
+        ArmsCalibration.load(path)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.messages.arms_calibration import load_arms_calibration
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.arms_calibration import ArmsCalibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.calibration_file import CalibrationFileError
-from flexsheet.messages.marker_calibration import load_marker_calibration
-from flexsheet.messages.sheet_calibration import load_sheet_calibration
+from flexsheet.messages.marker_calibration import MarkerCalibration
+from flexsheet.messages.sheet_calibration import SheetCalibration
 
 ROOT = Path(__file__).resolve().parent.parent
 WHOLE = next((ROOT / "launch" / "calibrations").glob("*.yaml")).read_text()
@@ -33,10 +33,10 @@ HOSTILE = {
 @pytest.mark.parametrize(
     "load",
     [
-        load_calibration,
-        load_arms_calibration,
-        load_sheet_calibration,
-        load_marker_calibration,
+        StereoCalibration.load,
+        ArmsCalibration.load,
+        SheetCalibration.load,
+        MarkerCalibration.load,
     ],
 )
 def test_it_is_rejected(tmp_path: Path, load: object, name: str) -> None:
@@ -60,6 +60,6 @@ def test_an_absurd_number_is_rejected_by_its_key(tmp_path: Path, key: str, value
     file = tmp_path / "calibration.yaml"
     file.write_text(head + found + value + rest[end:])
     with pytest.raises(CalibrationFileError, match=key):
-        load_calibration(file)
+        StereoCalibration.load(file)
     file.write_text(WHOLE)
-    load_calibration(file)
+    StereoCalibration.load(file)

@@ -23,7 +23,7 @@ from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, CameraTruth, FingerTruth
 from flexsheet.messages.calibration_file import CalibrationFileError
-from flexsheet.messages.marker_calibration import load_marker_calibration
+from flexsheet.messages.marker_calibration import MarkerCalibration
 from flexsheet.messages.types import Fingertip, StereoPair
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import rotation_from_vector
@@ -240,7 +240,7 @@ def test_a_marker_of_another_scene_is_refused(tmp_path: Path) -> None:
         load_graph(ROOT / "launch" / "demo.yaml", settings=[setting])
     file.write_text(json.dumps(found).replace("0.012", "NaN"))
     with pytest.raises(CalibrationFileError, match="marker_from_pad_m"):
-        load_marker_calibration(file)
+        MarkerCalibration.load(file)
 
 
 def test_exactly_one_source_is_required(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ from flexsheet.launch.cli import app
 from flexsheet.launch.experiments.force_reference import REFERENCE_FILE
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.shipped import LAUNCH_FILES
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.console.html_head import HERE
 from flexsheet.nodes.renderer.gl import shader_text
@@ -65,7 +65,7 @@ print(json.dumps({
     "files": {str(kind): [str(one) for one in found] for kind, found in paths.items()},
     "launched": launched,
     "scenes": [load_scene(one).name for one in paths["scene"] if one.suffix == ".yaml"],
-    "calibrations": [load_calibration(one).device for one in paths["calibration"]],
+    "calibrations": [StereoCalibration.load(one).device for one in paths["calibration"]],
     "shaders": [len(shader_text(one.name, CORRECTED=1, LENS=0, LOOK=0))
                 for one in Path(files("flexsheet.nodes.renderer")).glob("*.glsl")],
     "page": [len((HERE / name).read_text()) for name in ("page.css", "page.js")],

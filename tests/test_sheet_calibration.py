@@ -31,8 +31,6 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 from flexsheet.messages.sheet_calibration import (
     SheetCalibration,
-    load_sheet_calibration,
-    save_sheet_calibration,
 )
 from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
@@ -335,9 +333,9 @@ def test_twin_sheet_is_identified_from_its_pushes(twin_calibration: SheetCalibra
 
 def test_file_round_trip_keeps_the_law(twin_calibration: SheetCalibration, tmp_path: Path) -> None:
     file = tmp_path / "sheet.yaml"
-    save_sheet_calibration(twin_calibration, file, comment="made so")
+    twin_calibration.save(file, comment="made so")
     assert file.read_text().splitlines()[1] == "# made so"
-    again = load_sheet_calibration(file)
+    again = SheetCalibration.load(file)
     one, two = make_force_model(SCENE.sheet, twin_calibration), make_force_model(SCENE.sheet, again)
     depths = np.linspace(0.001, 0.04, 9)
     answers = [
@@ -360,7 +358,7 @@ def test_a_file_that_does_not_fit_is_rejected(
     file = tmp_path / "sheet.yaml"
     file.write_text(json.dumps({**twin_calibration.model_dump(mode="json"), **change}))
     with pytest.raises(CalibrationFileError, match=words):
-        load_sheet_calibration(file)
+        SheetCalibration.load(file)
 
 
 @pytest.mark.parametrize("content", ["- 1\n", "a: 1\n", "a: [\n", "version: 1\nscene: lab\n"])
@@ -370,9 +368,9 @@ def test_a_foreign_file_is_rejected(tmp_path: Path, content: str) -> None:
     with pytest.raises(
         CalibrationFileError, match=r"not YAML|not a calibration|`flexsheet calibrate sheet`"
     ):
-        load_sheet_calibration(file)
+        SheetCalibration.load(file)
     with pytest.raises(CalibrationFileError, match="cannot be read"):
-        load_sheet_calibration(tmp_path / "none.yaml")
+        SheetCalibration.load(tmp_path / "none.yaml")
 
 
 def test_another_sheets_calibration_is_rejected(twin_calibration: SheetCalibration) -> None:
@@ -396,12 +394,12 @@ def test_the_command_fits_rows_and_reports(tmp_path: Path) -> None:
     reported = json.loads(result.stdout)
     assert reported["modulus_thickness_n_per_m"]["value"] == pytest.approx(1000.0, rel=0.02)
     assert [one["line"] for one in reported["left_out"]] == [8]
-    assert load_sheet_calibration(file).source == str(rows)
+    assert SheetCalibration.load(file).source == str(rows)
     shown = CliRunner().invoke(app, [*arguments, "--table"])
     assert shown.exit_code == 0, shown.output
     assert re.search(r"^left out line 8 +\S+$", shown.stdout, re.MULTILINE)
     assert "N/m" in shown.stdout
-    table = load_sheet_calibration(file).table
+    table = SheetCalibration.load(file).table
     assert table is not None
     assert table.stretch_ratios == pytest.approx([1.02, 1.04, 1.06, 1.09])
 

@@ -17,7 +17,7 @@ from flexsheet.launch.experiments.simulated_time import (
 )
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
-from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.types import FingerPath
 from flexsheet.nodes.twin.paths import map_to_surface
 
@@ -72,7 +72,7 @@ def test_the_bridges_measure_a_lag_that_the_scene_does_not_state() -> None:
 
 def test_a_stroke_shows_the_error_of_the_marker_that_the_devices_do_not_report() -> None:
     """The calibrated camera is exact but for its device; the marker is 0.5 mm beside its place."""
-    optics = load_calibration(ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml")
+    optics = StereoCalibration.load(ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml")
     settings = LoopSettings(calibrations=NodeCalibrations(stereo=optics))
     nominal = nominal_apparatus(SCENE)
     finger = nominal.finger.model_copy(update={"marker_from_pad_m": (0.0, 5e-4, 0.0)})

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.calibration import Board, StereoCalibration, save_calibration
+from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene, StereoCamera
@@ -286,8 +286,8 @@ async def test_a_calibration_file_is_used_and_a_foreign_one_rejected(
     tmp_path: Path, scene: Scene, camera: TwinCamera
 ) -> None:
     own = calibration_of(scene.camera)
-    save_calibration(own, tmp_path / "own.yaml")
-    save_calibration(own.model_copy(update={"device": "other"}), tmp_path / "other.yaml")
+    own.save(tmp_path / "own.yaml")
+    own.model_copy(update={"device": "other"}).save(tmp_path / "other.yaml")
 
     bench = await Bench(camera, calibration=tmp_path / "own.yaml").start(scene)
     plain = await Bench(camera).start(scene)
@@ -341,7 +341,7 @@ async def test_from_the_twins_pixels_to_the_true_fingertip(
             truths.append(message)
 
     twin = TwinFingerNode(TwinFingerParameters(), name="finger", clock=clock, send=keep)
-    save_calibration(calibration_of(make_true_camera(scene.camera)), tmp_path / "rig.yaml")
+    calibration_of(make_true_camera(scene.camera)).save(tmp_path / "rig.yaml")
     perfect = TriangulatorParameters(calibration=tmp_path / "rig.yaml")
     eye = Triangulator(perfect, name="eye", clock=clock, send=keep)
     await eye.setup()

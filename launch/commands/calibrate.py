@@ -135,7 +135,6 @@ def stereo(
     from flexsheet.launch.calibration.stereo import calibrate_stereo
     from flexsheet.launch.commands import capture
     from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.messages.calibration import save_calibration
 
     _check_single_source(left, right, device_source, twin)
     require_twin(apparatus, simulated=twin is not None)
@@ -174,7 +173,7 @@ def stereo(
             working_distance_m=None if scene is None else measure_distance_m(scene),
             progress=progress,
         )
-    save_calibration(calibrated.calibration, output, comment=command_line())
+    calibrated.calibration.save(output, comment=command_line())
     page: Path | None = None
     if report is not None:
         from flexsheet.launch.calibration.report import write_report
@@ -226,11 +225,11 @@ def check(
 ) -> None:
     """Check a calibration with board images that were not used to compute the calibration."""
     from flexsheet.launch.calibration.check import check_stereo
-    from flexsheet.messages.calibration import load_calibration
+    from flexsheet.messages.calibration import StereoCalibration
 
     with progress_bar("measuring the board") as progress:
         result = check_stereo(
-            load_calibration(calibration),
+            StereoCalibration.load(calibration),
             _find_images("--left", left),
             _find_images("--right", right),
             board=parse_board(board, square_mm, marker_mm, dictionary),
@@ -376,13 +375,13 @@ def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
 
     Raises CommandError if the calibration belongs to another camera.
     """
-    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
+    from flexsheet.messages.calibration import StereoCalibration, refuse_other_camera
     from flexsheet.messages.calibration_file import CalibrationMismatchError
 
     if path is None:
         return None
     try:
-        calibration = load_calibration(path)
+        calibration = StereoCalibration.load(path)
         refuse_other_camera(calibration, scene.camera)
     except CalibrationMismatchError as error:
         raise CommandError(f"{path}: {error}") from error

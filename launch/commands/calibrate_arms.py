@@ -104,7 +104,6 @@ def arms(
     --twin to simulate the arms.
     """
     from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.messages.arms_calibration import save_arms_calibration
 
     if twin == (left_arm is not None or right_arm is not None):
         raise CommandError("give either --twin, or --left-arm, --right-arm or both")
@@ -128,7 +127,7 @@ def arms(
             if folder is not None:
                 fits[side], blind[side] = fit_folder(folder, described, scene, optics, side)
     measured = make_calibration(fits, scene, described)
-    save_arms_calibration(measured, output, comment=command_line())
+    measured.save(output, comment=command_line())
     if copy is not None:
         write_scene_values(scene_file, list_scene_values(measured), copy)
     truth = (
@@ -151,11 +150,11 @@ def write_scene(
 ) -> None:
     """Write a copy of a scene file with the base poses of an arm calibration."""
     from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.messages.arms_calibration import load_arms_calibration
+    from flexsheet.messages.arms_calibration import ArmsCalibration
 
     _check_new_file(output, "-o")
     load_scene(scene_file)
-    write_scene_values(scene_file, list_scene_values(load_arms_calibration(calibration)), output)
+    write_scene_values(scene_file, list_scene_values(ArmsCalibration.load(calibration)), output)
     print_outcome({"scene": str(output)}, f"scene: {output}", as_json=as_json)
 
 

@@ -68,8 +68,7 @@ def marker(
     from flexsheet.launch.calibration.touches import read_touches, simulate_touches
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.apparatus import nominal_apparatus
-    from flexsheet.messages.calibration import load_calibration
-    from flexsheet.messages.marker_calibration import save_marker_calibration
+    from flexsheet.messages.calibration import StereoCalibration
 
     if (rows is None) == (twin is None):
         raise CommandError("give exactly one source of touches: --rows CSV or --twin SCENE")
@@ -84,11 +83,11 @@ def marker(
         assert twin is not None
         scene = load_scene(twin)
         true = load_true_devices(apparatus, scene) or nominal_apparatus(scene)
-        optics = None if calibration_file is None else load_calibration(calibration_file)
+        optics = None if calibration_file is None else StereoCalibration.load(calibration_file)
         touches = simulate_touches(scene, true, calibration=optics, seed=seed)
         source = f"twin of {scene.name}"
     calibration = make_calibration(touches, scene, source)
-    save_marker_calibration(calibration, output, comment=command_line())
+    calibration.save(output, comment=command_line())
     values = calibration.model_dump(mode="json")
     print_result({"calibration": str(output), **values}, as_json=as_json)
 

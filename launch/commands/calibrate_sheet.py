@@ -98,7 +98,6 @@ def sheet(
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
     from flexsheet.launch.calibration.sheet_rows import read_rows
     from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
     if sum(one is not None for one in (rows, bag, twin)) != 1:
         raise CommandError(
@@ -135,7 +134,7 @@ def sheet(
         )
     except SheetModelFitError as error:
         raise CommandError(f"{source}: {error}") from error
-    save_sheet_calibration(calibration, output, comment=command_line())
+    calibration.save(output, comment=command_line())
     _print_result(calibration, output, as_json)
 
 

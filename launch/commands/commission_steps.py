@@ -48,8 +48,6 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import (
     Board,
     StereoCalibration,
-    load_calibration,
-    save_calibration,
 )
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene, require_projector
@@ -199,7 +197,8 @@ class Laboratory:
     def _load(self, lab: Commissioning) -> tuple[Scene, StereoCalibration | None]:
         """Load the scene, and also the stereo calibration if the step `camera` is finished."""
         stereo = lab.find_file(STEREO)
-        return load_scene(lab.scene_copy), None if stereo is None else load_calibration(stereo)
+        calibration = None if stereo is None else StereoCalibration.load(stereo)
+        return load_scene(lab.scene_copy), calibration
 
     def calibrate_camera(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.capture import Capture
@@ -231,7 +230,7 @@ class Laboratory:
                 device=camera.device,
                 working_distance_m=calibrate.measure_distance_m(scene),
             ).calibration
-        save_calibration(found, lab.folder / STEREO)
+        found.save(lab.folder / STEREO)
         assert found.uncertainty is not None
         return StepResult(
             residual=found.reprojection_rms_px,
@@ -247,7 +246,6 @@ class Laboratory:
         )
 
     def calibrate_arms(self, lab: Commissioning) -> StepResult:
-        from flexsheet.messages.arms_calibration import save_arms_calibration
 
         scene, optics = self._load(lab)
         fits = {}
@@ -263,7 +261,7 @@ class Laboratory:
                     poses, self.flange_board, scene, optics, side
                 )
         measured = calibrate_arms.make_calibration(fits, scene, self.flange_board)
-        save_arms_calibration(measured, lab.folder / ARMS)
+        measured.save(lab.folder / ARMS)
         uncertainty = {}
         for side, fit in fits.items():
             std_m, std_rad = fit.compute_std(np.zeros(3))
@@ -281,7 +279,6 @@ class Laboratory:
     def calibrate_sheet(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.sheet_fit import MAX_RMS_SIGMAS, SheetModelFitError
         from flexsheet.launch.calibration.sheet_rows import read_rows
-        from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
         scene = load_scene(lab.scene_copy)
         if self.apparatus is None:
@@ -314,7 +311,7 @@ class Laboratory:
                 "max_stretch_ratio": found.max_stretch_ratio / wider,
             }
         )
-        save_sheet_calibration(found, lab.folder / SHEET)
+        found.save(lab.folder / SHEET)
         assert found.residual_rms_sigmas is not None
         return StepResult(
             residual=found.residual_rms_sigmas,
@@ -404,7 +401,6 @@ class Laboratory:
 
     def calibrate_marker(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.touches import read_touches, simulate_touches
-        from flexsheet.messages.marker_calibration import save_marker_calibration
 
         scene, optics = self._load(lab)
         radius_m = self.finger_radius_m
@@ -417,7 +413,7 @@ class Laboratory:
             true_m = apply_apparatus(scene, self.apparatus).finger.radius_m
             radius_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
         found = calibrate_marker.make_calibration(touches, scene, source)
-        save_marker_calibration(found, lab.folder / MARKER)
+        found.save(lab.folder / MARKER)
         uncertainty = {
             f"{axis}_mm": 1e3 * deviation_m
             for axis, deviation_m in zip("xyz", found.standard_deviations_m, strict=True)

@@ -54,13 +54,13 @@ def compliance(
     )
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.running.precompute import report_time_left
-    from flexsheet.messages.sheet_calibration import load_sheet_calibration
+    from flexsheet.messages.sheet_calibration import SheetCalibration
     from flexsheet.nodes.planner.compliance import ObjectCurve
     from flexsheet.nodes.planner.force_table import choose_force_model
 
     scene = load_scene(scene_file)
     law, _ = choose_force_model(
-        scene, None if calibration is None else load_sheet_calibration(calibration)
+        scene, None if calibration is None else SheetCalibration.load(calibration)
     )
     with progress_words() as progress:
         reporters = {stage: report_time_left(stage, progress) for stage in ForceCurveStage}

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
-from flexsheet.messages.calibration import StereoCalibration, load_calibration
-from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker_calibration
+from flexsheet.messages.calibration import StereoCalibration
+from flexsheet.messages.marker_calibration import MarkerCalibration
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
+from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.nodes import node_class
 from flexsheet.nodes.models.finger_frame import world_from_finger
 
@@ -46,11 +46,11 @@ class NodeCalibrations:
                 stamp_offset_s = node.parameters["stamp_offset_s"]
             if issubclass(kind, node_class("triangulator")):
                 if path := node.parameters["calibration"]:
-                    stereo = load_calibration(Path(path))
+                    stereo = StereoCalibration.load(Path(path))
                 if path := node.parameters["marker_calibration"]:
-                    marker = load_marker_calibration(Path(path))
+                    marker = MarkerCalibration.load(Path(path))
             if issubclass(kind, node_class("planner")) and node.parameters["sheet_calibration"]:
-                sheet = load_sheet_calibration(Path(node.parameters["sheet_calibration"]))
+                sheet = SheetCalibration.load(Path(node.parameters["sheet_calibration"]))
         return NodeCalibrations(stereo, sheet, marker, stamp_offset_s)
 
     def find_marker_offset_m(self, scene: Scene) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.sheet_calibration import load_sheet_calibration
+from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.messages.units import format_percent
 from flexsheet.nodes import cache
 from flexsheet.nodes.arrays import Floats
@@ -228,7 +228,7 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     calibration = given.sheet_calibration
     law, _ = choose_force_model(
         scene,
-        None if calibration is None else load_sheet_calibration(calibration),
+        None if calibration is None else SheetCalibration.load(calibration),
         given.sheet_force,
         given.cache_dir,
     )

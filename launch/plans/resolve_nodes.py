@@ -13,11 +13,11 @@ from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_y
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.launch_file import RECORDER_NICE, ClocksSpec, LaunchFile, NodeSpec
 from flexsheet.launch.plans.plan_model import LAUNCHER, RUN_DIRECTORY, TOOLS, ResolvedPort, tools_on
-from flexsheet.messages.calibration import load_calibration, refuse_other_camera
+from flexsheet.messages.calibration import StereoCalibration, refuse_other_camera
 from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-from flexsheet.messages.marker_calibration import load_marker_calibration, refuse_other_marker
+from flexsheet.messages.marker_calibration import MarkerCalibration, refuse_other_marker
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
+from flexsheet.messages.sheet_calibration import SheetCalibration, refuse_other_sheet
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.nodes import NODES, NodeImportError, UnknownNodeError, node_class
 from flexsheet.nodes.node import (
@@ -277,14 +277,14 @@ CALIBRATION_CHECKS: dict[
     ParameterMark, tuple[Callable[[Path], Any], Callable[[Any, Scene], None]]
 ] = {
     ParameterMark.CAMERA_CALIBRATION: (
-        load_calibration,
+        StereoCalibration.load,
         lambda measured, scene: refuse_other_camera(measured, scene.camera),
     ),
     ParameterMark.SHEET_CALIBRATION: (
-        load_sheet_calibration,
+        SheetCalibration.load,
         lambda measured, scene: refuse_other_sheet(measured, scene.sheet),
     ),
-    ParameterMark.MARKER_CALIBRATION: (load_marker_calibration, refuse_other_marker),
+    ParameterMark.MARKER_CALIBRATION: (MarkerCalibration.load, refuse_other_marker),
 }
 """The two functions that load and check each kind of calibration file.
 

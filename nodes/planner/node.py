@@ -10,7 +10,7 @@ import scipy
 from flexsheet.messages.base import Header
 from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
+from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.messages.types import (
     ArmLatency,
     Fingertip,
@@ -87,7 +87,7 @@ class Planner(Node):
         path = self.parameters.sheet_calibration
         self._calibration: SheetCalibration | None = None
         if path is not None:
-            self._calibration = load_sheet_calibration(path)
+            self._calibration = SheetCalibration.load(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         # If the new object cannot be presented, the last object's plan must not stay in use.

@@ -13,10 +13,9 @@ import numpy as np
 import scipy
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.calibration import StereoCalibration, load_calibration
+from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.marker_calibration import (
     MarkerCalibration,
-    load_marker_calibration,
     refuse_other_marker,
 )
 from flexsheet.messages.methods import resolve_method
@@ -102,9 +101,9 @@ class Triangulator(Node):
         # SciPy imports a submodule on first use, which must not delay an image.
         _ = scipy.special
         if path := self.parameters.calibration:
-            self.calibration = load_calibration(path)
+            self.calibration = StereoCalibration.load(path)
         if path := self.parameters.marker_calibration:
-            self.marker_calibration = load_marker_calibration(path)
+            self.marker_calibration = MarkerCalibration.load(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         p = self.parameters
