@@ -26,13 +26,13 @@ from flexsheet.nodes.node import Input, Node, find_parameters_type, find_ports, 
 from flexsheet.nodes.twin import tolerance_table
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
-    TOLERANCES,
     TRUTH_SECTIONS,
     Profile,
     deviate_apparatus,
     expand_key,
     iterate_paths,
     list_differences,
+    load_tolerances,
     sample_apparatus,
     value_at,
 )
@@ -78,10 +78,10 @@ def test_the_nominal_apparatus_is_the_scene(scene: Scene) -> None:
 
 
 def test_each_field_has_one_row_of_the_table(scene: Scene) -> None:
-    rows = [path for row in TOLERANCES.values() for path in expand_key(row.key)]
+    rows = [path for row in load_tolerances().values() for path in expand_key(row.key)]
     assert sorted(rows) == sorted(all_paths(scene))
-    assert all(row.source for row in TOLERANCES.values())
-    assert all(row.calibrated_source for row in TOLERANCES.values() if row.calibrated)
+    assert all(row.source for row in load_tolerances().values())
+    assert all(row.calibrated_source for row in load_tolerances().values() if row.calibrated)
 
 
 def test_fields_that_are_not_simulated_are_listed(scene: Scene) -> None:
@@ -119,8 +119,9 @@ def test_seeds_differ(scene: Scene) -> None:
 
 def test_a_new_row_changes_no_other_value(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     before = values_of(scene, 3)
-    fewer = {key: row for key, row in TOLERANCES.items() if key != "camera.position_offset_m"}
-    monkeypatch.setattr(tolerance_table, "TOLERANCES", fewer)
+    fewer = dict(load_tolerances())
+    del fewer["camera.position_offset_m"]
+    monkeypatch.setattr(tolerance_table, "load_tolerances", lambda: fewer)
     after = values_of(scene, 3)
     assert {path for path in before if before[path] != after[path]} == {"camera.position_offset_m"}
 
@@ -156,14 +157,14 @@ def test_the_mean_and_spread_of_a_row_are_those_of_its_draws() -> None:
         ("sheet.thickness_ratio", 1.0, 0.06),
         ("camera.stamp_offset_s", 0.0, 10e-3 / np.sqrt(12.0)),
     ):
-        given = TOLERANCES[key].of(Profile.MODERN, calibrated=False)
+        given = load_tolerances()[key].of(Profile.MODERN, calibrated=False)
         assert not isinstance(given, tuple)
         draws = np.array([given.draw(random) for _ in range(4000)])
         assert draws.mean() == pytest.approx(mean, abs=0.06 * sigma)
         assert draws.std() == pytest.approx(sigma, rel=0.05)
 
 
-@pytest.mark.parametrize("key", TOLERANCES)
+@pytest.mark.parametrize("key", load_tolerances())
 def test_one_row_can_deviate_alone(scene: Scene, key: str) -> None:
     for profile in Profile:
         for sigmas in (-3.0, 1.0):

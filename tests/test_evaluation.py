@@ -54,11 +54,7 @@ from flexsheet.messages.types import SelfCheck, Status, SuspectedCause
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.paths import touchable
-from flexsheet.nodes.twin.tolerance_table import (
-    NOT_SIMULATED,
-    TOLERANCES,
-    Profile,
-)
+from flexsheet.nodes.twin.tolerance_table import NOT_SIMULATED, Profile, load_tolerances
 from tests.indentation_bases import few_dents
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -341,8 +337,8 @@ def test_tolerances_are_those_of_the_scene(scene: Scene) -> None:
 
 
 def test_each_parameter_is_evaluated_or_says_why_not() -> None:
-    assert set(TOLERANCES) >= sensitivity.TIMING
-    for parameter in TOLERANCES:
+    assert set(load_tolerances()) >= sensitivity.TIMING
+    for parameter in load_tolerances():
         found = sensitivity.evaluation_of(parameter)
         assert (found is sensitivity.EvaluationKind.NOT_SIMULATED) == (parameter in NOT_SIMULATED)
         assert parameter.partition(".")[0] in sensitivity.AFFECTED
@@ -429,7 +425,7 @@ def test_parameters_that_matter_in_motion_are_evaluated_in_simulated_time() -> N
 
 def test_an_unknown_parameter_is_refused() -> None:
     with pytest.raises(BadInputError, match=r"sheet\.modulus_ration.*sheet\.modulus_ratio"):
-        select_names(["sheet.modulus_ration"], TOLERANCES, "parameter")
+        select_names(["sheet.modulus_ration"], load_tolerances(), "parameter")
 
 
 # The bound of a followed finger

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
-    TOLERANCES,
     Distribution,
     HalfNormal,
     LogNormal,
@@ -15,6 +14,7 @@ from flexsheet.nodes.twin.tolerance_table import (
     Tolerance,
     Uniform,
     expand_key,
+    load_tolerances,
 )
 from website.messages_page import format_table
 
@@ -23,7 +23,7 @@ def render() -> str:
     """Return the table; values that the simulator does not use have a mark."""
     heads = ("parameter", "unit", "`modern`", "`paper`", "source", "calibrated", "source")
     rows = []
-    for row in TOLERANCES.values():
+    for row in load_tolerances().values():
         mark = " †" if any(path in NOT_SIMULATED for path in expand_key(row.key)) else ""
         paper = "" if row.paper is None else _describe(row, Profile.PAPER, calibrated=False)
         calibrated = "as before"

@@ -171,9 +171,9 @@ def sensitivity(
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment
     from flexsheet.launch.experiments.pictures import draw_sensitivity
-    from flexsheet.nodes.twin.tolerance_table import TOLERANCES, Profile
+    from flexsheet.nodes.twin.tolerance_table import Profile, load_tolerances
 
-    selected = select_names(options.split_names(parameters), TOLERANCES, "parameter")
+    selected = select_names(options.split_names(parameters), load_tolerances(), "parameter")
     folder = make_result_folder(output, "sensitivity")
     image = folder / "sensitivity.png"
     with progress_words() as progress:
