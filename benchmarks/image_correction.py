@@ -23,7 +23,6 @@ from typing import get_args
 import numpy as np
 
 from flexsheet.launch.calibration.simulated_sheet import solve_sheet
-from flexsheet.launch.experiments.image import summarize_eyes
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display
@@ -107,8 +106,7 @@ class CorrectionBench:
         if len(sizes) == 0:
             return "dark"
         figures = f"{sizes.mean():.2f} / {np.quantile(sizes, 0.95):.2f} / {sizes.max():.2f}"
-        share = len(sizes) / self._whole
-        return figures if share > 0.985 else f"{figures} ({100 * share:.0f} %)"
+        return f"{figures} ({100 * len(sizes) / self._whole:.0f} %)"
 
 
 def row(*cells: object) -> None:
@@ -203,6 +201,17 @@ def print_places(bench: CorrectionBench) -> None:
         row(f"{place[0]}, {place[1]}", *cells)
 
 
+def summarize_eyes(left: ErrorMap, right: ErrorMap) -> list[float]:
+    """Return the mean errors (mm) of the left and right image, and of both disparities.
+
+    The disparity error is the error of the right eye minus the error of the left eye, horizontally
+    and vertically, where both eyes see the object. A value is NaN if there are no points.
+    """
+    across, up = np.moveaxis(np.abs(right.errors_m - left.errors_m), -1, 0)
+    parts = (left.sizes_m, right.sizes_m, across, up)
+    return [1e3 * float(np.nanmean(part)) if np.isfinite(part).any() else np.nan for part in parts]
+
+
 def print_eyes(bench: CorrectionBench) -> None:
     """Print the error of each eye's image and of the disparity, against the true sheet."""
     scene, half = bench.scene, np.array([0.5 * bench.scene.eyes.interocular_m, 0.0, 0.0])
@@ -216,12 +225,10 @@ def print_eyes(bench: CorrectionBench) -> None:
         for name, case in cases:
             situation = one.situation(*case)
             for correction in EYE_CORRECTIONS:
-                found = one.errors(correction, *situation)
-                maps.setdefault((name, correction), []).append(found)
-    heading("sheet, mm", "method", "left", "right", "disparity", "vertical", "disparity, 95 %")
+                maps.setdefault((name, correction), []).append(one.errors(correction, *situation))
+    heading("sheet, mm", "method", "left", "right", "disparity", "vertical")
     for (name, correction), (left, right) in maps.items():
-        figures = summarize_eyes(left, right).values()
-        row(name, correction, *("-" if figure is None else f"{figure:.3f}" for figure in figures))
+        row(name, correction, *(f"{error:.3f}" for error in summarize_eyes(left, right)))
 
 
 def print_stretches(bench: CorrectionBench) -> None:

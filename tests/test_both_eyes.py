@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flexsheet.launch.experiments import image
+from benchmarks.image_correction import summarize_eyes
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
@@ -128,29 +127,7 @@ def test_disparity_is_the_difference_between_the_eyes() -> None:
     left, right = np.full((4, 4, 2), 1e-3), np.full((4, 4, 2), 1e-3)
     left[..., 0], right[..., 0] = -2e-3, 2e-3
     right[0, 0] = np.nan
-    found = image.summarize_eyes(ErrorMap(left), ErrorMap(right))
-    assert found["disparity_mean_mm"] == pytest.approx(4.0)
-    assert found["disparity_p95_mm"] == pytest.approx(4.0)
-    assert found["vertical_disparity_mean_mm"] == pytest.approx(0.0)
-    assert found["left_mean_mm"] == pytest.approx(np.sqrt(5.0))
-    dark = image.summarize_eyes(ErrorMap(left), ErrorMap(np.full((4, 4, 2), np.nan)))
-    assert dark["right_mean_mm"] is None
-    assert dark["disparity_mean_mm"] is None
-
-
-def test_rows_contain_the_errors_of_both_eyes() -> None:
-    series = replace(image.PUSH, values=(10,))
-    black = np.zeros((400, 400, 3), np.uint8)
-    white = black.copy()
-    white[150:250, 100:300] = 255
-    pictures = {}
-    for correction in image.CORRECTIONS:
-        label = series.label(10, correction)
-        pictures[label] = image.EyeImage(label, correction, 1e-3, white, white)
-        for pattern in image.RAMPS:
-            for viewpoint in ("left", "right"):
-                key = image.make_eye_key(image.make_eyes_label(label, pattern), viewpoint)
-                pictures[key] = image.EyeImage(key, correction, 1e-3, black, black)
-    row = image.make_rows(pictures, series, with_eyes=True)[0]
-    assert row["left_mean_mm"] is None, "nothing is lit"
-    assert {"right_mean_mm", "disparity_mean_mm", "vertical_disparity_mean_mm"} <= set(row)
+    found = summarize_eyes(ErrorMap(left), ErrorMap(right))
+    assert found == pytest.approx([np.sqrt(5.0), np.sqrt(5.0), 4.0, 0.0])
+    dark = summarize_eyes(ErrorMap(left), ErrorMap(np.full((4, 4, 2), np.nan)))
+    assert np.isnan(dark[1:]).all()

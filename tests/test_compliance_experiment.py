@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any, cast
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -28,7 +27,6 @@ from flexsheet.launch.experiments.compliance import (
 )
 from flexsheet.launch.experiments.driver import Driver, TableMethod
 from flexsheet.launch.experiments.force_reference import ReferenceForce, find_reference_curve
-from flexsheet.launch.experiments.pictures import draw_compliance
 from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.bag import BagWriter
@@ -178,28 +176,6 @@ def test_a_bag_without_a_soft_body_is_rejected(tmp_path: Path) -> None:
         read_bag(bag)
 
 
-def test_the_image_shows_each_position(tmp_path: Path) -> None:
-    rows = [
-        {
-            "at": place,
-            "depth_mm": depth,
-            "reference_n": 0.05 * depth if depth < 16.0 else None,
-            "wanted_n": 0.051 * depth,
-            "felt_n": 0.052 * depth,
-        }
-        for place in ("at 0, 0 mm", "at 25, 0 mm")
-        for depth in (5.0, 20.0)
-    ]
-    moving = {
-        "speed_mm_per_s": 50.0,
-        "rows": [{"depth_mm": 3.0, "wanted_n": 0.1, "felt_n": 0.2}],
-    }
-    picture = tmp_path / "compliance.png"
-    draw_compliance({"rows": rows, "moving": moving, "noticed_percent": [15, 22]}, picture)
-    height, width = cv2.imread(str(picture)).shape[:2]
-    assert width > 1.5 * height
-
-
 class Bench:
     """Driver without sockets, which receives the messages of a soft-body node from the test."""
 
@@ -288,7 +264,7 @@ async def test_a_table_that_fails_ends_the_experiment_with_the_reason() -> None:
 
 
 async def test_a_table_that_takes_too_long_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver, "MAX_TABLE_WAIT_S", 0.01)
+    monkeypatch.setattr(driver, "MAX_WAIT_S", 0.01)
     bench = Bench()
     bench.report("precomputing the soft body: 4 %")
     with pytest.raises(ExperimentError, match=r"(?s)quick table.*fem_solver: precom"):

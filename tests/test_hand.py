@@ -28,7 +28,6 @@ from flexsheet.launch.experiments.simulated_time import (
     make_soft_body,
     touch_in_simulated_time,
 )
-from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.bag import BagReader
@@ -461,10 +460,10 @@ def push_in_graph(hand: HandImpedance, path: FingerPath, folder: Path) -> GraphR
         await driver.follow(path)
 
     bag = folder / "push.mcap"
-    settings = [*choose_ports(DEMO), "twin_finger.hand=coupled"]
-    run_experiment(
-        DEMO, settings, bag, procedure, print, apparatus=str(apparatus), without=[Feature.IMAGE]
-    )
+    scene = folder / "scene.yaml"
+    scene.write_text(SCENE.model_copy(update={"projector": None}).model_dump_json())
+    settings = [*choose_ports(DEMO), "twin_finger.hand=coupled", f"scene={scene}"]
+    run_experiment(DEMO, settings, bag, procedure, print, apparatus=str(apparatus))
     return read_push(path, bag)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.needed_nodes import REASON_TEXTS
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -70,20 +69,6 @@ def test_a_scene_that_says_less_starts_less(tmp_path: Path) -> None:
     assert body.endpoints == ()
     # A console can change to a scene that says more.
     assert omitted(load_graph(path, console=True)) == {}
-
-
-@pytest.mark.parametrize(
-    ("without", "expected"),
-    [
-        ([Feature.IMAGE], {"renderer", "twin_eye"}),
-        ([Feature.FORCE], {"twin_eye"}),
-        ([Feature.IMAGE, Feature.FORCE], {"renderer", "twin_eye", "fem_solver"}),
-    ],
-)
-def test_a_run_can_leave_out_image_and_force(without: list[Feature], expected: set[str]) -> None:
-    plan = load_graph(DEMO, without=without)
-    assert omitted(plan).keys() == expected
-    assert plan.hash != load_graph(DEMO).hash
 
 
 def test_a_node_whose_inputs_nobody_writes_is_left_out(tmp_path: Path) -> None:

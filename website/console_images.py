@@ -23,7 +23,6 @@ from playwright.async_api import Page, async_playwright, expect
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import run_experiment
 from flexsheet.launch.experiments.stroke import object_pose
-from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import RunningGraph
@@ -190,11 +189,11 @@ async def photograph(bag: Path) -> None:
     """Save images of the page of a running graph: tab Touch, a replay, and tab Graph when dark."""
     # The page needs most of the processor time of a computer without a graphics card.
     settings = [f"console.bags={bag.parent}", "fem_solver.compute_table=false"]
-    plan = load_graph(DEMO, settings=settings, console=True, without=[Feature.IMAGE])
+    plan = load_graph(DEMO, settings=settings, console=True)
     precompute_graph(plan, print)
     url = f"http://127.0.0.1:{plan.nodes['console'].parameters['page_port']}/"
     expect.set_options(timeout=DEADLINE_MS)
-    async with RunningGraph(plan) as graph:
+    async with RunningGraph(plan, without=("renderer",)) as graph:
         await graph.wait_ready(DEADLINE_MS / 1e3)
         async with open_page(url, PAGE_PX, dark=False) as page:
             await dismiss_notice(page)

@@ -29,7 +29,7 @@ from flexsheet.nodes import node_class
 from flexsheet.nodes.twin.tolerance_table import set_value
 
 STATE_FILE, SCENE_FILE, LAUNCH_FILE = "commission.json", "scene.yaml", "launch.yaml"
-REPORT_FILE, APPARATUS_FILE, CROSSES_FILE = "report.md", "apparatus.yaml", "co-location.png"
+REPORT_FILE, APPARATUS_FILE = "report.md", "apparatus.yaml"
 
 
 class CommissionError(FlexsheetError, ValueError):
@@ -482,8 +482,6 @@ def _format_figures(figures: Mapping[str, Any]) -> list[str]:
         lines += [
             "| co-location of image and touch, mean / maximum | "
             f"{crosses['mean_mm']:.3g} / {crosses['max_mm']:.3g} mm |",
-            "",
-            f"![Seen crosses relative to touched points]({CROSSES_FILE})",
         ]
     return [*lines, "", f"All figures: {STATE_FILE}, steps.verification.result.figures."]
 

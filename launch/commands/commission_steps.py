@@ -20,7 +20,6 @@ import numpy as np
 
 from flexsheet.launch.calibration.commission import (
     APPARATUS_FILE,
-    CROSSES_FILE,
     CommissionError,
     Commissioning,
     MissingDataError,
@@ -644,7 +643,6 @@ def run_verification(
     Raises VerificationError if the stroke fails.
     """
     from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
-    from flexsheet.launch.experiments.maps import draw_cross_errors
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
     from flexsheet.launch.experiments.offline import (
         MOVING_METRICS,
@@ -690,13 +688,11 @@ def run_verification(
     assert apparatus is not None
     speed_m_per_s = scene.working_range.speed_m_per_s
     moving = evaluator.evaluate(apparatus, MOVING_METRICS, speed_m_per_s).figures()
-    crosses = evaluator.compare_crosses(apparatus)
-    draw_cross_errors(crosses, lab.folder / CROSSES_FILE)
     return {
         "stroke": stroke,
         "at_rest": at_rest,
         "at_working_speed": {one: moving[one] for one in MOVING_METRICS},
-        "co_location": crosses.figures(),
+        "co_location": evaluator.compare_crosses(apparatus).figures(),
         "out_of_tolerance": exceeded_tolerances(scene, at_rest["after"]),
         "flagged": stroke["flagged"],
     }

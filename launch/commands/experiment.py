@@ -9,7 +9,6 @@ import typer
 
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
-    CommandError,
     examples,
     print_columns,
     print_json,
@@ -18,7 +17,6 @@ from flexsheet.launch.commands.output import (
     shown,
     words,
 )
-from flexsheet.launch.plans.features import Feature
 from flexsheet.messages.units import format_percent
 
 if TYPE_CHECKING:
@@ -32,23 +30,6 @@ StrokeOption = Annotated[
     float,
     typer.Option(
         "--duration", metavar="SECONDS", min=1.0, max=600.0, help="Duration of each stroke, s."
-    ),
-]
-BothEyesOption = Annotated[
-    bool,
-    typer.Option(
-        "--both-eyes",
-        help="Also measure the image errors of each eye and the error of the disparity; this "
-        "triples the duration.",
-    ),
-]
-MapOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--map",
-        metavar="IMAGE",
-        help="Image file (.png) to write with the error at each visible point; this doubles the "
-        "duration.",
     ),
 ]
 
@@ -71,47 +52,15 @@ def make_result_folder(output: Path | None, name: str) -> Path:
     epilog=examples(
         "flexsheet experiment stroke --duration 30",
         "flexsheet experiment stroke --set triangulator.tracking=none --json",
-        "flexsheet experiment stroke --repeats 10 --ablations --radii --output runs/table-1",
     )
 )
 def stroke(
     *,
     seconds: StrokeOption = 10.0,
-    repeats: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            max=1000,
-            help="Number of strokes; each stroke runs in a new graph with another random seed. "
-            "Several strokes give the 95 % confidence interval of the mean.",
-        ),
-    ] = 1,
-    ablations: Annotated[
-        bool,
-        typer.Option(
-            "--ablations",
-            help="Also measure variants: without prediction, with each tracking method, with the "
-            "force rendered by stretch only, and with cameras of 15, 30 and 60 Hz.",
-        ),
-    ] = False,
-    radii: Annotated[
-        bool,
-        typer.Option("--radii", help="Also measure strokes on a cylinder of twice the radius."),
-    ] = False,
-    workers: options.WorkersOption = 1,
-    scheduler: options.SchedulerOption = None,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
     apparatus: options.ApparatusOption = None,
-    without: Annotated[
-        list[Feature] | None,
-        typer.Option(
-            help="Part of the display to omit: the projected image or the rendered force. If the "
-            "image is omitted, frame latencies are null. The option cannot be combined with "
-            "several strokes or variants."
-        ),
-    ] = None,
     switches: Annotated[
         int,
         typer.Option(
@@ -119,7 +68,7 @@ def stroke(
             max=1000,
             help="Number of switches of the projected image between white and black after the "
             "stroke, for the latency of the projector. The bag then contains the images of the "
-            "camera. The option cannot be combined with several strokes.",
+            "camera.",
         ),
     ] = 0,
     output: options.ResultFolderOption = None,
@@ -127,39 +76,9 @@ def stroke(
 ) -> None:
     """Simulate a finger that strokes a cylinder over 60 degrees, and measure the sheet's errors.
 
-    Furukawa et al. 2007 describe this experiment in section V and Table I. To continue an
-    interrupted command with several strokes or variants, repeat it with the same --output.
+    Furukawa et al. 2007 describe this experiment in section V and Table I.
     """
     given = options.with_scene(settings, scene)
-    if radii and scene is not None:
-        raise CommandError("--radii uses the cylinder scenes of the package; remove --scene")
-    if repeats > 1 or ablations or radii:
-        if switches:
-            raise CommandError(
-                "--switches needs a single stroke; remove --repeats, --ablations and --radii"
-            )
-        from flexsheet.launch.experiments import stroke_table
-
-        folder = make_result_folder(output, "strokes")
-        variants = stroke_table.make_variants(
-            launch_file, folder, apparatus=apparatus, ablations=ablations, radii=radii
-        )
-        with progress_words() as progress:
-            table = stroke_table.run_stroke_table(
-                variants,
-                given,
-                folder,
-                progress,
-                seconds=seconds,
-                repeats=repeats,
-                workers=workers,
-                scheduler=scheduler,
-            )
-        if as_json:
-            print_json(table)
-        else:
-            _print_stroke_table(table)
-        return
     from flexsheet.launch.experiments import stroke as experiment
     from flexsheet.launch.experiments.run import (
         chain_procedures,
@@ -175,7 +94,6 @@ def stroke(
         if switches:
             procedure = chain_procedures(procedure, make_switch_procedure(switches, progress))
             given = [*given, "recorder.include=[stereo]"]
-        omitted = without or ()
         run_experiment(
             launch_file,
             given,
@@ -183,7 +101,6 @@ def stroke(
             procedure,
             progress,
             apparatus=apparatus,
-            without=omitted,
             check_scene=require_cylinder,
         )
         recording = experiment.read_recording(bag)
@@ -196,11 +113,9 @@ def stroke(
         words.print(f"bag: {bag}")
 
 
-@app.command(epilog=examples("flexsheet experiment tilt --map tilt.png"))
+@app.command(epilog=examples("flexsheet experiment tilt --json"))
 def tilt(
     *,
-    map_file: MapOption = None,
-    both_eyes: BothEyesOption = False,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
@@ -217,38 +132,14 @@ def tilt(
         bag,
         launch_file,
         options.with_scene(settings, scene),
-        map_file=map_file,
-        both_eyes=both_eyes,
         apparatus=apparatus,
         as_json=as_json,
     )
 
 
-@app.command(
-    epilog=examples(
-        "flexsheet experiment push", "flexsheet experiment push --at 50 --tilt 20 --json"
-    )
-)
+@app.command(epilog=examples("flexsheet experiment push --json"))
 def push(
     *,
-    at_mm: Annotated[
-        float,
-        typer.Option(
-            "--at",
-            metavar="MM",
-            help="Contact position along the axis of the cylinder, relative to its centre, mm.",
-        ),
-    ] = 0.0,
-    tilt_deg: Annotated[
-        float,
-        typer.Option(
-            "--tilt",
-            metavar="DEG",
-            help="Contact angle around the axis of the cylinder, degrees; it tilts the sheet.",
-        ),
-    ] = 0.0,
-    map_file: MapOption = None,
-    both_eyes: BothEyesOption = False,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
@@ -261,7 +152,7 @@ def push(
     As in the paper, the arms hold the edges of the sheet still while the finger pushes. With
     `--set planner.compliance_mode=force_curve`, the arms move the sheet away from the finger.
     """
-    from flexsheet.launch.experiments.image import make_push_series
+    from flexsheet.launch.experiments.image import PUSH
     from flexsheet.launch.experiments.run import make_settings
 
     settings = [
@@ -270,12 +161,10 @@ def push(
     ]
     bag = make_result_folder(output, "push") / "push.mcap"
     _measure_images(
-        make_push_series(at_mm, tilt_deg),
+        PUSH,
         bag,
         launch_file,
         settings,
-        map_file=map_file,
-        both_eyes=both_eyes,
         apparatus=apparatus,
         as_json=as_json,
         with_table=True,
@@ -306,20 +195,18 @@ def compliance(
     the cache, its computation takes about a minute.
     """
     from flexsheet.launch.experiments import compliance as experiment
-    from flexsheet.launch.experiments.pictures import draw_compliance
     from flexsheet.launch.experiments.run import run_experiment
 
     folder = make_result_folder(output, "compliance")
-    bag, image = folder / "compliance.mcap", folder / "compliance.png"
+    bag = folder / "compliance.mcap"
     with progress_words() as progress:
         table: TableMethod = "nonlinear_table" if complete_table else "quick_table"
         procedure = experiment.make_compliance_procedure(progress, table)
         given = options.with_scene(settings, scene)
         run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
-        draw_compliance(result, image)
     if as_json:
-        print_json({**result, "figure": str(image)})
+        print_json(result)
         return
     columns = {
         "position": ("at", ""),
@@ -347,7 +234,6 @@ def compliance(
         f"{result['noticed_percent'][0]:.0f} to {result['noticed_percent'][1]:.0f} %"
     )
     words.print(f"bag: {bag}")
-    words.print(f"image: {image}")
 
 
 def _measure_images(
@@ -356,8 +242,6 @@ def _measure_images(
     launch_file: Path,
     settings: list[str],
     *,
-    map_file: Path | None,
-    both_eyes: bool,
     apparatus: str | None,
     as_json: bool,
     with_table: bool = False,
@@ -368,7 +252,6 @@ def _measure_images(
         computed.
     """
     from flexsheet.launch.experiments import image
-    from flexsheet.launch.experiments.maps import draw_error_maps
     from flexsheet.launch.experiments.run import (
         chain_procedures,
         make_image_procedure,
@@ -377,16 +260,8 @@ def _measure_images(
     )
     from flexsheet.messages.scene import require_cylinder
 
-    mapped = map_file is not None
     with progress_words() as progress:
-        procedure = make_image_procedure(
-            series,
-            series.values,
-            image.CORRECTIONS,
-            progress,
-            with_maps=mapped,
-            with_eyes=both_eyes,
-        )
+        procedure = make_image_procedure(series, series.values, image.CORRECTIONS, progress)
         if with_table:
             procedure = chain_procedures(make_table_procedure(progress), procedure)
         needed = ["twin/eye"]
@@ -401,13 +276,10 @@ def _measure_images(
             check_scene=require_cylinder,
         )
         pictures = image.read_images(bag)
-        rows = image.make_rows(pictures, series, with_maps=mapped, with_eyes=both_eyes)
-        if map_file is not None:
-            draw_error_maps(pictures, series, map_file)
+        rows = image.make_rows(pictures, series)
     if as_json:
-        maps = {} if map_file is None else {"map": str(map_file)}
         by_method = image.summarize_methods(rows)
-        print_json({"rows": rows, "by_method": by_method, "bag": str(bag), **maps})
+        print_json({"rows": rows, "by_method": by_method, "bag": str(bag)})
         return
     cells = [
         [f"{cell:.2f}" if isinstance(cell, float) else cell for cell in row.values()]
@@ -415,8 +287,6 @@ def _measure_images(
     ]
     print_table(list(rows[0]), cells)
     words.print(f"bag: {bag}")
-    if map_file is not None:
-        words.print(f"map: {map_file}")
 
 
 def _show_ratio(ratio: float | None) -> str:
@@ -481,29 +351,6 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
     print_table(columns, rows)
 
 
-def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print the mean errors of each variant over all strokes, with 95 % confidence intervals."""
-
-    def with_interval(found: dict[str, Any] | None) -> str:
-        if found is None:
-            return "-"
-        if found["interval"] is None:
-            return f"{found['mean']:.3f}"
-        return f"{found['mean']:.3f} ± {found['interval']:.3f}"
-
-    columns = ["variant", "strokes", "Δd, mm", "Δθ, °", "true Δd, mm", "true Δθ, °"]
-    keys = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
-    cells = [
-        [row["variant"], row["strokes"], *(with_interval(row[key]) for key in keys)]
-        for row in table["rows"]
-    ]
-    print_table(columns, cells)
-    for row in table["rows"]:
-        for error in row["failed"]:
-            words.print(f"{row['variant']}: a stroke failed: {error}")
-    words.print(f"rows: {table['folder']}")
-
-
 @app.command(
     epilog=examples(
         "flexsheet experiment stability",
@@ -531,7 +378,6 @@ def stability(
     import json
 
     from flexsheet.launch.experiments import stability as experiment
-    from flexsheet.launch.experiments.pictures import draw_stability
     from flexsheet.launch.experiments.run import require_scene
     from flexsheet.launch.health.compliance import ForceCurveStage, compute_front_curve
     from flexsheet.launch.plans.plan import load_graph
@@ -553,13 +399,12 @@ def stability(
             experiment.StabilitySettings(hands=hands, seed=seed),
             progress,
         )
-    file, image = folder / "stability.json", folder / "stability.png"
+    file = folder / "stability.json"
     file.write_text(json.dumps(result, indent=1) + "\n")
-    draw_stability(result, image)
     if as_json:
         lists = ("rows", "without_bounds", "boundary")
         summary = {key: value for key, value in result.items() if key not in lists}
-        print_json({**summary, "file": str(file), "picture": str(image)})
+        print_json({**summary, "file": str(file)})
         return
     rows = [*result["rows"], *result["without_bounds"]]
     cells = []
@@ -576,4 +421,4 @@ def stability(
             f"error of the predicted critical gain: {median:.0f} % median, "
             f"{error:.0f} % at the 95 % quantile, in {len(result['boundary'])} simulated cases"
         )
-    words.print(f"image: {image}")
+    words.print(f"all cases: {file}")

@@ -170,12 +170,10 @@ def sensitivity(
     """
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment
-    from flexsheet.launch.experiments.pictures import draw_sensitivity
     from flexsheet.nodes.twin.tolerance_table import Profile, load_tolerances
 
     selected = select_names(options.split_names(parameters), load_tolerances(), "parameter")
     folder = make_result_folder(output, "sensitivity")
-    image = folder / "sensitivity.png"
     with progress_words() as progress:
         result = experiment.run_sensitivity(
             launch_file,
@@ -189,9 +187,8 @@ def sensitivity(
             workers=workers,
             scheduler=scheduler,
         )
-        draw_sensitivity(result, image)
     if as_json:
-        print_json({**result, "figure": str(image)})
+        print_json(result)
         return
     metrics = list(result["tolerances"])
     largest = {
@@ -221,7 +218,6 @@ def sensitivity(
         )
         if listed:
             words.print(f"{name.replace('_', ' ')}: {', '.join(listed)}")
-    words.print(f"image: {image}")
 
 
 @app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))

@@ -30,7 +30,6 @@ from flexsheet.messages.types import (
     FingerPath,
     Frame,
     HostStatus,
-    Pattern,
     Shading,
     SheetTarget,
     Skin,
@@ -38,7 +37,6 @@ from flexsheet.messages.types import (
     Status,
     TwinEye,
     TwinFinger,
-    Viewpoint,
 )
 from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
@@ -69,11 +67,8 @@ SETTLED_SPEED_M_PER_S = 0.05
 SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
-EYE_PIXELS_EVERY = 9
-"""The number of frames from one frame with pixels to the next.
+"""The number of frames from one frame with pixels to the next."""
 
-The number is odd, so that frames with pixels alternate between both eyes.
-"""
 WAIT_S = 20.0
 FRAME_WAIT_S = 20.0
 """The maximum time to wait for the next frame, or for the eye's image after the last frame."""
@@ -393,46 +388,32 @@ class Driver:
         self._publish("display", display)
 
     async def capture_image(
-        self,
-        label: str,
-        correction: Correction,
-        shading: Shading = "flat",
-        *,
-        pattern: Pattern = "object",
-        both_eyes: bool = False,
+        self, label: str, correction: Correction, shading: Shading = "flat"
     ) -> None:
         """Display the object with an image correction, and wait for the simulated eye's image.
 
         label: label of the image. shading: "flat" for a sharp outline in measurements, "soft" for
-        figures. both_eyes: whether to wait for an image of each eye, instead of a single image.
+        figures.
         """
         if "frame" not in self._subscribers:
             self._subscribe("frame")
         self.show(
             Display(
                 correction=correction,
-                stereo="frame_sequential" if both_eyes else "mono",
+                stereo="mono",
                 shading=shading,
-                pattern=pattern,
                 marks=False,
-                pixels_every=EYE_PIXELS_EVERY if both_eyes else PIXELS_EVERY,
+                pixels_every=PIXELS_EVERY,
                 label=label,
             )
         )
-        viewpoints: set[Viewpoint] = set()
 
         def received() -> bool:
             eye = self._newest.get("twin/eye")
-            if isinstance(eye, TwinEye) and eye.label == label:
-                viewpoints.add(eye.viewpoint)
-            return len(viewpoints) == (2 if both_eyes else 1)
+            return isinstance(eye, TwinEye) and eye.label == label
 
-        await self.wait_for(
-            received,
-            f'the eye\'s image of "{label}"',
-            FRAME_WAIT_S,
-            progress=Frame,
-        )
+        what = f'the eye\'s image of "{label}"'
+        await self.wait_for(received, what, FRAME_WAIT_S, progress=Frame)
         # Stop sending pixels in frames until the next image.
         self.show(Display(correction=correction, stereo="side_by_side"))
 

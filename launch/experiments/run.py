@@ -20,7 +20,6 @@ import numpy as np
 
 from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError, image, stroke
 from flexsheet.launch.experiments.driver import Driver
-from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.precompute import precompute_graph
@@ -116,14 +115,13 @@ def run_experiment(
     *,
     apparatus: str | None = None,
     needed: Collection[str] = (),
-    without: Collection[Feature] = (),
     check_scene: Callable[[Scene], object] = lambda scene: None,
 ) -> None:
     """Run an experiment's procedure (coroutine) on the graph of a launch file.
 
     bag: file to which all topics are recorded, or None if nothing is recorded.
     check_scene: function that raises an error if the experiment does not support the scene.
-    settings, apparatus, needed, without: arguments for `load_graph`.
+    settings, apparatus, needed: arguments for `load_graph`.
     """
     plan = load_graph(
         launch_file,
@@ -131,7 +129,6 @@ def run_experiment(
         record=bag,
         apparatus=apparatus,
         needed=needed,
-        without=without,
     )
     check_scene(require_scene(plan))
     precompute_graph(plan, progress)
@@ -217,17 +214,12 @@ def make_image_procedure(
     progress: Progress,
     *,
     shading: Shading = "flat",
-    with_maps: bool = False,
-    with_eyes: bool = False,
 ) -> Procedure:
     """Make a procedure (coroutine) that captures images of the sheet.
 
     There is one image for each value of a varied quantity and each image correction.
 
     values: values of the quantity that the experiment `series` varies.
-    with_maps: whether to also take images of coordinate ramps, whose brightness encodes a
-        coordinate. The errors at all visible points are computed from these images.
-    with_eyes: whether to also take images of coordinate ramps for each eye separately.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -238,14 +230,6 @@ def make_image_procedure(
             for correction in corrections:
                 label = series.label(value, correction)
                 await driver.capture_image(label, correction, shading)
-                for pattern in image.RAMPS if with_maps else ():
-                    ramp_label = image.make_pattern_label(label, pattern)
-                    await driver.capture_image(ramp_label, correction, pattern=pattern)
-                for pattern in image.RAMPS if with_eyes else ():
-                    eyes_label = image.make_eyes_label(label, pattern)
-                    await driver.capture_image(
-                        eyes_label, correction, pattern=pattern, both_eyes=True
-                    )
 
     return procedure
 

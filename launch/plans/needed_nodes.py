@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
-from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan_model import OmittedNode
 from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.scene import Scene
@@ -24,19 +23,6 @@ REASON_TEXTS = {
     OmissionReason.NO_READER: "no node of the graph reads the topics that this node publishes",
     OmissionReason.NO_WRITER: "no node of the graph publishes the topics that this node reads",
 }
-
-
-def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
-    """Return a copy of the scene that displays no image or no force, as chosen.
-
-    features: features to remove.
-    """
-    changes: dict[str, object] = {}
-    if Feature.IMAGE in features:
-        changes["projector"] = None
-    if Feature.FORCE in features:
-        changes["methods"] = scene.methods.model_copy(update={"compliance": "constant_stretch"})
-    return scene.model_copy(update=changes)
 
 
 def omit_unneeded(

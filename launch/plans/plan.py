@@ -27,7 +27,6 @@ from flexsheet.launch.plans.documents import (
     Problem,
     validate,
 )
-from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.hosts import check_hosts
 from flexsheet.launch.plans.launch_file import (
     LaunchFile,
@@ -37,7 +36,7 @@ from flexsheet.launch.plans.launch_file import (
     read_launch_file,
     read_scene_file,
 )
-from flexsheet.launch.plans.needed_nodes import omit_unneeded, remove_features
+from flexsheet.launch.plans.needed_nodes import omit_unneeded
 from flexsheet.launch.plans.plan_model import (
     MAIN,
     ResolvedGraph,
@@ -76,7 +75,6 @@ def load_graph(
     console: bool = False,
     apparatus: str | None = None,
     needed: Collection[str] = (),
-    without: Collection[Feature] = (),
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
@@ -88,7 +86,6 @@ def load_graph(
     apparatus: true parameters of the simulated hardware, as a file name or "seed:N". If it is None,
         the scene contains the true parameters.
     needed: topics that the caller reads. The nodes that write these topics are started.
-    without: parts of the display that are omitted.
 
     Raises BadInputError, which lists all errors of the file, if the file is invalid.
     """
@@ -102,8 +99,6 @@ def load_graph(
     spec = validate(LaunchFile, document)
     check_hosts(spec.hosts, document)
     scene_document, scene = _load_scene(spec, document)
-    if scene is not None:
-        scene = remove_features(scene, without)
     entries = collect_entries(spec, document)
     for entry in entries:
         resolve_entry(entry, document)
