@@ -14,7 +14,7 @@ SOURCES := flexsheet messages nodes launch benchmarks website
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: help setup demo try test test-parallel test-long lint cached bench bench-gpu faults soak limits load tune-scenes \
+.PHONY: help setup demo try test test-parallel test-long lint cached bench bench-gpu faults soak limits load \
 	pages charts \
 	docs lock release clean
 
@@ -130,17 +130,6 @@ pages: setup  ## insert figures from docs/results into the pages, and draw docs/
 
 charts: setup  ## measure every method of every family for docs/charts; takes 7 minutes on 2 cores
 	$(BIN)/flexsheet chart --output docs/charts
-
-# An interrupted command continues, because finished scenes and strokes in runs/tune are not repeated.
-tune-scenes: setup  ## tune all shipped scenes on an idle machine; takes hours
-	@mkdir -p runs/tune; status=0; \
-	for scene in launch/scenes/*.yaml; do \
-		folder=runs/tune/$$(basename $$scene .yaml); \
-		[ ! -f $$folder.json ] || continue; \
-		OPENBLAS_NUM_THREADS=1 $(BIN)/flexsheet tune $$scene --runs-folder $$folder --json \
-			> $$folder.part; code=$$?; \
-		case $$code in 0|3) mv $$folder.part $$folder.json ;; *) status=1 ;; esac; \
-	done; exit $$status
 
 # An interrupted command continues.
 load: setup $(DEV_STAMP)  ## measure errors, latency and safety against load (requires root)

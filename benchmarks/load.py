@@ -48,9 +48,9 @@ from flexsheet.launch.experiments.stroke import read_recording
 from flexsheet.launch.experiments.sweep import open_sweep, read_rows
 from flexsheet.launch.experiments.system_errors import APPROACH_S, STROKE, make_stroke
 from flexsheet.launch.experiments.system_run import evaluate_stroke
-from flexsheet.launch.methods.configurations import write_launch_file
 from flexsheet.launch.methods.results import describe_load, machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
+from flexsheet.launch.methods.system_chart import write_launch_file
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.files import write_file

@@ -1,13 +1,13 @@
-"""Measure the regret of tracking methods: their errors relative to the best method and to a bound.
+"""Measure the regret of the tracking: its error relative to its best model and to a bound.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_regret [--seeds 100-101] [--json]
         [--recording FILE] [--output docs/charts]
 
-The truth is `benchmarks.hand_motion`, which shares nothing with any method.  Seeds 0 to 99 are for
-development.  The least possible error is that of the best linear predictor (Wiener), built from the
-autocovariance of another, long recording of the same hand and the true measurement noise; it reads
-MAX_TAPS_S of measurements and knows no single axis from another.  A recorded finger (t_s, x_mm,
-y_mm, z_mm) is interpolated by a spline and has no such bound.  --output writes
+The truth is `benchmarks.hand_motion`, which shares nothing with the tracking. Seeds 0 to 99 are
+for development. The least possible error is that of the best linear predictor (Wiener), built from
+the autocovariance of another, long recording of the same hand and the true measurement noise; it
+reads MAX_TAPS_S of measurements and knows no single axis from another. A recorded finger (t_s,
+x_mm, y_mm, z_mm) is interpolated by a spline and has no such bound. --output writes
 `tracking-regret.json`, from which `make docs` makes the tables of docs/tracking.md.
 """
 
@@ -35,16 +35,10 @@ from benchmarks.hand_motion import (
     sample_wander,
 )
 from benchmarks.tracking_bench import ROOT, bench_scene
-from flexsheet.launch.methods.charts import git_commit
 from flexsheet.launch.methods.results import describe_load, machine_name
+from flexsheet.launch.running.commit import read_commit
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.triangulator.adaptive import (
-    TRACKING_METHODS,
-    AdaptiveBank,
-    BankEstimate,
-    predict_by_model,
-)
-from flexsheet.nodes.triangulator.filters import Estimate
+from flexsheet.nodes.triangulator.adaptive import AdaptiveBank, BankEstimate, predict_by_model
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 
 FILE_NAME = "tracking-regret.json"
@@ -77,9 +71,9 @@ class Hand:
 
 @dataclass(frozen=True, slots=True)
 class Regret:
-    """The conditions of one case, and the RMS error (mm) of each method and reference.
+    """The conditions of one case, and the RMS error (mm) of the tracking and of each reference.
 
-    error_mm: error by method.
+    error_mm: error of the tracking, under the key "adaptive".
     bank_mm: error of the best single model of the bank, chosen in hindsight.
     wiener_mm: error of the predictor that knows the spectrum, or None for a recorded hand.
     """
@@ -183,12 +177,12 @@ def predict_with_spectrum(
     return predicted
 
 
-def compare_methods(
+def compare_predictions(
     hand: Hand, noise_px: float, rate_hz: int, seed: int, step_s: dict[str, list[float]]
 ) -> Iterator[Regret]:
-    """Measure a hand, and compare the methods' predictions at each horizon.
+    """Measure a hand, and compare the predictions at each horizon.
 
-    step_s: receives the time of each update with its predictions, by method.
+    step_s: receives the time of each update with its predictions, under the key "adaptive".
     """
     step = round(GRID_HZ / rate_hz)
     count = (len(hand.path) - round(HORIZONS_S[-1] * GRID_HZ)) // step
@@ -207,33 +201,22 @@ def compare_methods(
         return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
     world_m = 1e-3 * measured @ axes.T
-    errors: list[dict[str, float]] = [{} for _ in HORIZONS_S]
-    hindsight: list[float] = []
-    for name, make in TRACKING_METHODS.items():
-        filter_ = make(1.5)
-        estimate: Estimate | None = None
-        predicted = np.empty((len(HORIZONS_S), count, 3))
-        by_model: list[Floats] = []
-        durations = step_s.setdefault(name, [])
-        for i, at_ns in enumerate(times_ns.tolist()):
-            begin_s = time.perf_counter()
-            estimate = (
-                filter_.initialize(at_ns, world_m[i], covariance)
-                if estimate is None
-                else filter_.update(estimate, at_ns, world_m[i], covariance)
-            )
-            predicted[:, i] = filter_.predict(estimate, np.array(HORIZONS_S))
-            durations.append(time.perf_counter() - begin_s)
-            if isinstance(estimate, BankEstimate):
-                by_model.append(predict_by_model(estimate, np.array(HORIZONS_S)))
-        for horizon in range(len(HORIZONS_S)):
-            errors[horizon][name] = rms_mm(1e3 * predicted[horizon] @ axes, horizon)
-        if isinstance(filter_, AdaptiveBank):
-            models = 1e3 * np.array(by_model) @ axes  # (count, horizons, models, 3)
-            hindsight = [
-                min(rms_mm(models[:, horizon, model], horizon) for model in range(models.shape[2]))
-                for horizon in range(len(HORIZONS_S))
-            ]
+    bank = AdaptiveBank(max_speed_m_per_s=1.5)
+    estimate: BankEstimate | None = None
+    predicted = np.empty((len(HORIZONS_S), count, 3))
+    by_model: list[Floats] = []
+    durations = step_s.setdefault("adaptive", [])
+    for i, at_ns in enumerate(times_ns.tolist()):
+        begin_s = time.perf_counter()
+        estimate = (
+            bank.initialize(at_ns, world_m[i], covariance)
+            if estimate is None
+            else bank.update(estimate, at_ns, world_m[i], covariance)
+        )
+        predicted[:, i] = bank.predict(estimate, np.array(HORIZONS_S))
+        durations.append(time.perf_counter() - begin_s)
+        by_model.append(predict_by_model(estimate, np.array(HORIZONS_S)))
+    models = 1e3 * np.array(by_model) @ axes  # (count, horizons, models, 3)
     for horizon, horizon_s in enumerate(HORIZONS_S):
         wiener_mm = None
         if hand.autocovariance is not None:
@@ -249,25 +232,27 @@ def compare_methods(
             rate_hz=rate_hz,
             horizon_ms=round(1e3 * horizon_s),
             seed=seed,
-            error_mm=errors[horizon],
-            bank_mm=hindsight[horizon],
+            error_mm={"adaptive": rms_mm(1e3 * predicted[horizon] @ axes, horizon)},
+            bank_mm=min(
+                rms_mm(models[:, horizon, model], horizon) for model in range(models.shape[2])
+            ),
             wiener_mm=wiener_mm,
         )
 
 
 def measure_all(seeds: Sequence[int], recording: Path | None) -> dict[str, Any]:
     """Return the result of `--json`: machine, commit, time of a step by method, and all cases."""
-    commit = git_commit()
+    commit = read_commit()
     cases: list[Regret] = []
     step_s: dict[str, list[float]] = {}
     for seed in seeds:
         for hand in draw_hands(seed):
             for rate_hz, noise_px in product(RATES_HZ, NOISES_PX):
-                cases += compare_methods(hand, noise_px, rate_hz, seed, step_s)
+                cases += compare_predictions(hand, noise_px, rate_hz, seed, step_s)
     if recording is not None:
         hand = read_recording(recording)
         for rate_hz, noise_px in product(RATES_HZ, NOISES_PX):
-            cases += compare_methods(hand, noise_px, rate_hz, seeds[0], step_s)
+            cases += compare_predictions(hand, noise_px, rate_hz, seeds[0], step_s)
     return {
         "machine": machine_name(),
         "load": describe_load(),

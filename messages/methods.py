@@ -1,7 +1,7 @@
 """Define the names of the methods between which nodes can choose.
 
 A method family is a set of interchangeable methods for one task (`nodes/methods.py`). The command
-`flexsheet tune SCENE` writes the best methods to the key `methods` of a scene. A node uses these
+`flexsheet tune SCENE` names the best methods for the key `methods` of a scene. A node uses these
 methods if its parameter has the value `auto`. Any other value of the parameter overrides the scene.
 """
 
@@ -15,9 +15,6 @@ from flexsheet.messages.limits import LimitedModel
 
 T = TypeVar("T", bound=str | float)
 
-MarkerMethod = Literal["moments", "subpixel_fit"]
-TrackingMethod = Literal["none", "one_euro", "adaptive"]
-SheetForceMethod = Literal["scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 SoftBodyMethod = Literal["linear", "nonlinear_table"]
@@ -41,9 +38,6 @@ class Methods(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    marker: MarkerMethod | None = None
-    tracking: TrackingMethod | None = None
-    sheet_force: SheetForceMethod | None = None
     sheet_shape: SheetShapeMethod | None = None
     correction: Correction | None = None
     soft_body: SoftBodyChoice | None = None

@@ -275,7 +275,7 @@ def test_a_new_track_is_predicted_from_its_first_points() -> None:
 
 
 def test_a_point_that_is_not_finite_never_enters() -> None:
-    tracker = Tracker(BANK, TrackingSettings(max_speed_m_per_s=1.5))
+    tracker = Tracker(TrackingSettings(max_speed_m_per_s=1.5))
     path, times_s = hand(16, 2.2), np.arange(0.0, 2.0, 1 / 60)
     points = measured_at(path, times_s)
     for i, time_s in enumerate(times_s.tolist()):

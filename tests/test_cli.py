@@ -35,6 +35,7 @@ from flexsheet.nodes import NODES, NodeImportError
 from tests.commands import Command
 from tests.example_bag import write_example
 from tests.test_doctor_hosts import make_status
+from tests.test_experiments import make_family
 from tests.waiting import DEADLINE_S, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -892,16 +893,19 @@ def test_calibrating_with_real_images(flexsheet: Command, tmp_path: Path) -> Non
     } <= checked.json().keys()  # fmt: skip
 
 
-def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
-    """The test measures, draws, writes and prints the fastest family."""
-    printed = flexsheet("chart", "marker", "--output", tmp_path)
+def test_a_family_is_charted(
+    flexsheet: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command measures, draws, writes and prints a family."""
+    monkeypatch.setattr("flexsheet.launch.methods.charts.find_family", lambda _: make_family())
+    printed = flexsheet("chart", "example", "--output", tmp_path)
     assert printed.code == 0
-    assert [line.split()[0] for line in printed.out.splitlines()][:2] == ["method", "moments"]
-    assert {one.name for one in tmp_path.iterdir()} == {
-        "marker.svg", "marker.json", "README.md"
-    }  # fmt: skip
-    again = flexsheet("chart", "--redraw", "--output", tmp_path, "--json").json()
-    assert [one["family"] for one in again] == ["marker"]
+    assert [line.split()[0] for line in printed.out.splitlines()][:2] == ["method", "good"]
+    assert {one.name for one in tmp_path.iterdir()} == {"example.svg", "example.json"}
+    found = flexsheet("chart", "example", "--output", tmp_path, "--json").json()
+    assert {"family", "unit", "reference", "points", "front"} <= found.keys()
+    keys = {"method", "params", "median_s", "p99_s", "error", "in_range"}
+    assert all(keys <= point.keys() for point in found["points"])
 
 
 def test_the_schema_of_scene_files_is_printed(flexsheet: Command) -> None:

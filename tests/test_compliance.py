@@ -35,8 +35,6 @@ from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, SheetPush
-from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
-from flexsheet.nodes.planner import sheet_force
 from flexsheet.nodes.planner.compliance import (
     MAX_ADVANCE_PER_DEPTH,
     TARGET_ERROR_RATIO,
@@ -377,29 +375,3 @@ def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
     assert isinstance(result.exception, CalibrationFileError)
     assert exit_code(result.exception) == BAD_INPUT
     assert "cannot be read" in str(result.exception)
-
-
-def test_every_law_is_charted_within_the_scenes_range() -> None:
-    axes = np.array([1.02, 1.08]), np.array([0.002, 0.05]), np.array([0.0, 0.06])
-    table = TabulatedSheetModel(
-        ScaledSheetModel(sheet_force.make_rubber(SHEET)),
-        *axes,
-        np.array([0.0, 0.09]),
-        np.ones((2, 2, 2, 2)),
-    )
-    family = sheet_force.sheet_force_family(lambda *asked: 2.0, lambda scene: table)
-    trials = list(family.trials(SCENE))
-    assert {trial.method for trial in trials} == set(family.methods)
-    assert family.tolerance(SCENE) == pytest.approx(10.0)
-    assert {trial.case["position"] for trial in trials} == {
-        "centre",
-        "off-centre",
-        "near the clamp",
-        "near the free edge",
-    }
-    quick = [trial for trial in trials if trial.method != "membrane"]
-    for trial in quick:
-        pressed = trial.run()
-        assert trial.error(pressed) == pytest.approx(100 * abs(pressed.force_n[0] / 2.0 - 1.0))
-    scaled = [trial for trial in quick if trial.method == "scaled"]
-    assert all(trial.in_range for trial in scaled)

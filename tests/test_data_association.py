@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.data_association import (
     CLUTTER_RELEASE_TIME_S,
     SOLE_CANDIDATE_TIME_S,
@@ -30,7 +29,7 @@ class Bench:
 
     def __init__(self) -> None:
         settings = TrackingSettings(max_speed_m_per_s=1.5)
-        self.tracker = Tracker(TRACKING_METHODS["adaptive"](1.5), settings)
+        self.tracker = Tracker(settings)
         self.association = DataAssociation()
         self.random = np.random.default_rng(1)
         self.time_s = 10.0

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.models import rigid
-from flexsheet.nodes.triangulator.benchmarks import DrawnDisc, noisy
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
-from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.marker import BlobFilter
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Gate
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint
@@ -31,6 +30,7 @@ from flexsheet.nodes.twin.clutter import (
     touching_highlight,
 )
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
+from tests.drawn_discs import DrawnDisc, noisy
 from tests.examples import long_except
 from tests.scenes import load_cylinder
 
@@ -45,9 +45,8 @@ REACH_M = 0.009
 LAB = CLUTTER["lab"]
 
 
-def config(name: str = "subpixel_fit", **changes: object) -> DetectorConfig:
-    inputs = DetectorConfig(BlobFilter(), MARKER_METHODS[name], max_reprojection_px=1.5)
-    return replace(inputs, **changes)
+def config(**changes: object) -> DetectorConfig:
+    return replace(DetectorConfig(BlobFilter(), max_reprojection_px=1.5), **changes)
 
 
 def detect_in(
@@ -55,7 +54,6 @@ def detect_in(
     *,
     expected: Floats | None = None,
     radius_m: float = REACH_M,
-    name: str = "subpixel_fit",
     volume: tuple[Floats, Floats] = VOLUME,
     geometry: StereoGeometry = GEOMETRY,
     **changes: object,
@@ -63,7 +61,7 @@ def detect_in(
     found = detect_all(
         *pictures,
         geometry=geometry,
-        config=config(name, **changes),
+        config=config(**changes),
         volume=volume,
         gate=None if expected is None else Gate(expected, radius_m),
     )
@@ -130,10 +128,9 @@ def test_a_point_is_drawn_and_found_again(
         assert error_m(measured, truth) < 4e-4
 
 
-@pytest.mark.parametrize("name", sorted(MARKER_METHODS))
 @pytest.mark.parametrize("speed_m_per_s", long_except([0.0, 1.0], 1.0))
 def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
-    name: str, speed_m_per_s: float
+    speed_m_per_s: float,
 ) -> None:
     """The normalised squared error has a mean of 3 if the reported covariance is correct."""
     camera, random = twin(), np.random.default_rng(3)
@@ -145,7 +142,6 @@ def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
         reason, measured = detect_in(
             pictures(camera, tip, velocity),
             expected=tip + random.normal(0.0, 0.001, 3),
-            name=name,
         )
         reasons[reason] += 1
         assert measured is not None
@@ -153,8 +149,7 @@ def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
         errors.append(error)
         normalised.append(error @ np.linalg.solve(measured.covariance, error))
     assert reasons == {"ok": 40}
-    limit_m = {"moments": 1e-3, "subpixel_fit": 1.2e-4}[name]
-    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < limit_m
+    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 1.2e-4
     assert 0.5 < np.mean(normalised) < 6.0
 
 

@@ -102,10 +102,7 @@ def test_each_block_names_its_language() -> None:
 def test_python_runs(page: Path, clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = types.ModuleType(f"page_{page.stem.replace('-', '_')}")
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    with (
-        patch.dict("flexsheet.nodes.models.shapes.GEOMETRIES"),
-        patch.dict("flexsheet.nodes.triangulator.marker.MARKER_METHODS"),
-    ):
+    with patch.dict("flexsheet.nodes.models.shapes.GEOMETRIES"):
         for block in with_language("python")[page]:
             # Its lines count as the page's, for the trace of what fails.
             source = "\n" * block.line + block.text

@@ -18,25 +18,18 @@ from typer.testing import CliRunner
 from flexsheet.launch.cli import app
 from flexsheet.launch.experiments import ExperimentError, image, stroke
 from flexsheet.launch.methods.charts import (
-    FAMILIES,
     UnknownFamilyError,
     find_family,
     make_chart_result,
     measure_family,
+    render_overview,
     write_chart,
 )
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.methods.svg import INK
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header
-from flexsheet.messages.methods import (
-    Correction,
-    MarkerMethod,
-    SheetForceMethod,
-    SheetShapeMethod,
-    SoftBodyMethod,
-    TrackingMethod,
-)
+from flexsheet.messages.methods import Correction, SheetShapeMethod, SoftBodyMethod
 from flexsheet.messages.scene import Scene, UnfitGeometryError
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus
@@ -290,9 +283,6 @@ def test_what_numpy_answers_can_be_written(tmp_path: Path) -> None:
 
 
 CHOICES = {
-    "marker": MarkerMethod,
-    "tracking": TrackingMethod,
-    "sheet-force": SheetForceMethod,
     "sheet-shape": SheetShapeMethod,
     "correction": Correction,
     "soft-body": SoftBodyMethod,
@@ -306,28 +296,14 @@ def test_the_pages_chart_shows_every_method_that_can_be_chosen(family: str) -> N
     assert set(get_args(CHOICES[family])) <= shown, f"flexsheet chart {family} -o docs/charts"
 
 
-def test_charts_are_collected_on_a_page_and_drawn_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(FAMILIES, "made-up", "nowhere")
+def test_charts_are_collected_on_a_page(tmp_path: Path) -> None:
     family = make_family()
     points = [measure(trial, repeats=3) for trial in family.trials(SCENE)]
-    result = make_chart_result(family, SCENE, points)
-    result["family"] = "made-up"
-    older = {name: value for name, value in result.items() if name not in ("sweep_key", "code")}
-    newer = ("extra_metrics", "reference_uncertainty", "median_range_s", "error_range")
-    older["points"] = [
-        {k: v for k, v in point.items() if k not in newer} for point in result["points"]
-    ]
-    (tmp_path / "made-up.json").write_text(json.dumps(older))
-    outcome = CliRunner().invoke(app, ["chart", "--redraw", "--output", str(tmp_path)])
-    assert outcome.exit_code == 0, outcome.output
-    page = (tmp_path / "README.md").read_text()
-    assert "## made-up" in page
+    write_chart(make_chart_result(replace(family, sweep_key="depth_mm"), SCENE, points), tmp_path)
+    page = render_overview(tmp_path)
+    assert "## example" in page
     assert "| 0 | 2 | 1 of 2 | yes |" in page
-    assert (tmp_path / "made-up.svg").exists()
-    nothing = CliRunner().invoke(app, ["chart", "--redraw", "--output", str(tmp_path / "none")])
-    assert nothing.exit_code != 0
+    assert "example.svg" in page
 
 
 def test_an_unknown_family_gets_a_suggestion() -> None:

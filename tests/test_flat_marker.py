@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.calibration import StereoCalibration
-from flexsheet.nodes.triangulator.benchmarks import noisy
 from flexsheet.nodes.triangulator.ellipse import integrate_ellipse
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.flat_marker import DiscView, estimate_flat_pose
@@ -23,7 +22,6 @@ from flexsheet.nodes.triangulator.marker import (
     Marker,
     detect_blobs,
     fit_flat_markers,
-    subpixel_fit,
 )
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Gate
@@ -34,6 +32,7 @@ from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
 from flexsheet.nodes.twin.truth import apply_apparatus
+from tests.drawn_discs import noisy
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -258,7 +257,7 @@ def test_the_marker_of_an_apparatus_is_measured(profile: Profile, seed: int) -> 
         found = detect_all(
             *views,
             geometry=StereoGeometry.of(scene.camera, calibration),
-            config=DetectorConfig(FILTER, subpixel_fit, max_reprojection_px=1.5),
+            config=DetectorConfig(FILTER, max_reprojection_px=1.5),
             volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
             gate=None if number % 2 else Gate(marker, 0.009),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -13,26 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.nodes.methods import measure as measure_trial
-from flexsheet.nodes.triangulator import benchmarks
-from flexsheet.nodes.triangulator.benchmarks import MARKER, DrawnDisc, centre_bound_px, noisy
 from flexsheet.nodes.triangulator.marker import (
-    MARKER_METHODS,
-    Blob,
     BlobFilter,
     Marker,
     detect_blobs,
     is_overexposed,
+    subpixel_fit,
     window_around,
 )
 from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
+from tests.drawn_discs import DrawnDisc, centre_bound_px, noisy
 from tests.examples import long_except
-from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 LOOKS, SENSOR = BlobFilter(), PixelNoise()
-METHODS = sorted(MARKER_METHODS)
 
 
 def disc(
@@ -52,9 +46,9 @@ def disc(
     return np.clip(np.rint(ground + share * (level - ground)), 0, 255).astype(np.uint8)
 
 
-def markers_in(image: Image, name: str = "subpixel_fit") -> list[Marker]:
+def markers_in(image: Image) -> list[Marker]:
     blobs = detect_blobs(image, LOOKS)
-    return MARKER_METHODS[name]([image] * len(blobs), blobs, SENSOR)
+    return subpixel_fit([image] * len(blobs), blobs, SENSOR)
 
 
 def sound_marks_in(image: Image) -> list[Marker]:
@@ -66,22 +60,15 @@ def sound_marks_in(image: Image) -> list[Marker]:
 def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: float) -> None:
     """Without blur the smallest marker is the hardest at the worst position on the pixel grid."""
     image = disc((x, y), radius=radius)
-    for name, limit_px in (
-        ("moments", 0.35),
-        ("subpixel_fit", 0.04),
-    ):
-        markers = markers_in(image, name)
-        assert len(markers) == 1
-        assert np.linalg.norm(markers[0].centre - [x, y]) < limit_px
+    (marker,) = markers_in(image)
+    assert np.linalg.norm(marker.centre - [x, y]) < 0.04
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_a_window_gives_the_same_marker_as_the_whole_image(name: str) -> None:
+def test_a_window_gives_the_same_marker_as_the_whole_image() -> None:
     image = disc((61.3, 40.7), blur_px=0.7)
     window = window_around(np.array([65.0, 45.0]), image.shape, LOOKS.window_half_px)
     whole, near = detect_blobs(image, LOOKS), detect_blobs(image, LOOKS, window)
-    refine = MARKER_METHODS[name]
-    a, b = (refine([image], blobs, SENSOR)[0] for blobs in (whole, near))
+    a, b = (subpixel_fit([image], blobs, SENSOR)[0] for blobs in (whole, near))
     assert np.array_equal(a.centre, b.centre)
     assert np.array_equal(a.covariance, b.covariance)
 
@@ -259,51 +246,6 @@ def test_no_image_breaks_the_search(seed: int) -> None:
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), float(random.uniform(0.3, 3.0))))
     image = 127.0 + (image - image.mean()) * float(random.uniform(1.0, 20.0))
     picture = np.clip(image, 0, 255).astype(np.uint8)
-    for name in METHODS:
-        for marker in markers_in(picture, name):
-            assert np.isfinite(marker.centre).all()
-            assert np.linalg.eigvalsh(marker.covariance).min() > 0
-
-
-FEW_CASES = ((3.2, 2.0, 0.0, 0.0), (3.2, 1.0, 4.0, 0.0), (6.0, 1.0, 0.0, 3.0), (1.6, 4.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    "cases",
-    [FEW_CASES, pytest.param(benchmarks.MARKER_CASES, marks=pytest.mark.long)],
-    ids=["few", "all"],
-)
-def test_the_marker_family_distinguishes_the_methods(
-    cases: tuple[tuple[float, float, float, float], ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(benchmarks, "MARKER_CASES", cases)
-    monkeypatch.setattr(benchmarks, "MARKER_IMAGES", 12)
-    scene = load_cylinder()
-    points = [measure_trial(trial, repeats=1) for trial in MARKER.trials(scene)]
-    worst = {
-        name: max(point.error for point in points if point.in_range and point.method == name)
-        for name in MARKER.methods
-    }
-    # Ground that slopes under the mark shifts a centroid; the fit allows for it.
-    assert worst["subpixel_fit"] < 0.5 * MARKER.tolerance(scene)
-    assert MARKER.tolerance(scene) < worst["moments"]
-    for point in points:
-        assert point.error > 0.7 * float(point.params["bound_px"])
-
-
-def test_marker_methods_are_evaluated_with_the_nodes_noise(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    scene = load_cylinder()
-    believed: list[PixelNoise] = []
-
-    def spy(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
-        believed.append(noise)
-        return []
-
-    monkeypatch.setattr(benchmarks, "MARKER_METHODS", {"moments": spy})
-    loud = {"read_noise_levels": 4.0, "photons_per_level": 10.0}
-    camera = scene.camera.model_copy(update=loud)
-    trial = next(iter(MARKER.trials(scene.model_copy(update={"camera": camera}))))
-    trial.run()
-    assert believed == [PixelNoise(4.0, 10.0)]
+    for marker in markers_in(picture):
+        assert np.isfinite(marker.centre).all()
+        assert np.linalg.eigvalsh(marker.covariance).min() > 0

@@ -191,12 +191,12 @@ def test_latencies_speeds_and_forces(numbers: dict[str, Any]) -> None:
 
 def test_a_nodes_methods_are_those_of_its_parameters_else_of_its_scene() -> None:
     chosen = Methods.model_validate(
-        {"marker": "moments", "soft_body": {"method": "linear", "skin_spacing_m": 0.006}}
+        {"correction": "one_plane", "soft_body": {"method": "linear", "skin_spacing_m": 0.006}}
     )
     tuned = sessions.SCENE.model_copy(update={"methods": chosen})
-    eye = {"marker": "auto", "tracking": "auto", "rate_hz": 60.0}
-    assert describe_methods(eye, tuned) == "marker moments, tracking default"
-    assert describe_methods(eye, None) == "marker default, tracking default"
+    eye = {"correction": "auto", "sheet_shape": "auto", "rate_hz": 60.0}
+    assert describe_methods(eye, tuned) == "sheet_shape default, correction one_plane"
+    assert describe_methods(eye, None) == "sheet_shape default, correction default"
     assert describe_methods({"method": "auto"}, tuned) == "linear"
     assert describe_methods({"side": "left"}, tuned) is None
 

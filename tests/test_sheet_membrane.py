@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.nodes.models.sheet import membrane
-from flexsheet.nodes.models.sheet.force_models import MembraneSheetModel, SheetPush
 from flexsheet.nodes.models.sheet.membrane import (
     NoEquilibriumError,
     grade_coordinates,
@@ -107,10 +106,6 @@ def test_near_the_free_edge_and_the_clamp_there_is_an_answer() -> None:
             cells=14,
         )
         assert 0.0 < path.forces_n[0] < path.forces_n[1]
-    law = MembraneSheetModel(RUBBER)
-    assert law.invalid_reason(SheetPush(1.05, RADIUS, (0.0, 0.112)), 0.02)
-    assert law.invalid_reason(SheetPush(1.05, RADIUS), 0.001)
-    assert not law.invalid_reason(SheetPush(1.05, RADIUS, (0.05, 0.05)), 0.02)
 
 
 def test_mooneys_rubber_softens_when_stretched() -> None:

@@ -10,42 +10,36 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models.interpolation import interpolate_path
-from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
-from flexsheet.nodes.triangulator.filters import Estimate, Filter
+from flexsheet.nodes.triangulator.adaptive import AdaptiveBank, BankEstimate
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
-from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
-from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 Path = Callable[[float], Floats]
 
-SCENE = load_cylinder()
 FRAME_NS = 16_666_667
 NOISE = np.diag([1e-5, 2e-5, 8e-5]) ** 2
 SETTINGS = TrackingSettings(max_speed_m_per_s=1.5)
 
 
-def method(name: str) -> Filter:
-    return TRACKING_METHODS[name](SETTINGS.max_speed_m_per_s)
+BANK = AdaptiveBank(SETTINGS.max_speed_m_per_s)
 
 
-def new_tracker(name: str = "adaptive") -> Tracker:
-    return Tracker(method(name), SETTINGS)
+def new_tracker() -> Tracker:
+    return Tracker(SETTINGS)
 
 
-def followed(filter_: Filter, path: Path, frames: int, *, seed: int = 0) -> list[Estimate]:
+def followed(path: Path, frames: int, *, seed: int = 0) -> list[BankEstimate]:
     """Return the estimates after each of the frames of a noisily measured path."""
     generator = np.random.default_rng(seed)
-    estimates: list[Estimate] = []
+    estimates: list[BankEstimate] = []
     for frame in range(frames):
         at_ns = frame * FRAME_NS
         seen = path(at_ns * 1e-9) + np.sqrt(np.diag(NOISE)) * generator.standard_normal(3)
         estimates.append(
-            filter_.update(estimates[-1], at_ns, seen, NOISE)
+            BANK.update(estimates[-1], at_ns, seen, NOISE)
             if estimates
-            else filter_.initialize(at_ns, seen, NOISE)
+            else BANK.initialize(at_ns, seen, NOISE)
         )
     return estimates
 
@@ -71,68 +65,49 @@ def steady(time_s: float) -> Floats:
 # The filters
 
 
-@pytest.mark.parametrize("name", TRACKING_METHODS)
 @given(
     steps_ns=st.lists(st.integers(1_000, 90_000_000), min_size=1, max_size=20),
     way_m=st.floats(-0.05, 0.05),
 )
 @settings(max_examples=25, deadline=None)
 def test_every_estimate_is_finite_and_its_covariance_is_one(
-    name: str, steps_ns: list[int], way_m: float
+    steps_ns: list[int], way_m: float
 ) -> None:
-    filter_ = method(name)
-    estimate = filter_.initialize(0, np.zeros(3), NOISE)
+    estimate = BANK.initialize(0, np.zeros(3), NOISE)
     for step_ns in steps_ns:
-        estimate = filter_.update(estimate, estimate.at_ns + step_ns, np.full(3, way_m), NOISE)
-        position, velocity, covariance = filter_.moments(estimate)
+        estimate = BANK.update(estimate, estimate.at_ns + step_ns, np.full(3, way_m), NOISE)
+        position, velocity, covariance = BANK.moments(estimate)
         assert np.isfinite(position).all()
         assert np.isfinite(velocity).all()
         assert np.allclose(covariance, covariance.T)
         assert np.linalg.eigvalsh(covariance).min() > 0
-        assert np.isfinite(filter_.predict(estimate, np.array([0.0, 0.1]))).all()
+        assert np.isfinite(BANK.predict(estimate, np.array([0.0, 0.1]))).all()
 
 
-@pytest.mark.parametrize("name", TRACKING_METHODS)
-def test_the_path_ahead_begins_where_the_finger_is(name: str) -> None:
-    filter_ = method(name)
-    last = followed(filter_, steady, 50)[-1]
-    position, velocity, _ = filter_.moments(last)
-    ahead = filter_.predict(last, np.array([0.0, 1e-4]))
+def test_the_path_ahead_begins_where_the_finger_is() -> None:
+    last = followed(steady, 50)[-1]
+    position, velocity, _ = BANK.moments(last)
+    ahead = BANK.predict(last, np.array([0.0, 1e-4]))
     assert ahead[0] == pytest.approx(position, abs=1e-15)
     assert (ahead[1] - ahead[0]) / 1e-4 == pytest.approx(velocity, abs=1e-2)
 
 
-def lag_s(name: str, lead_s: float) -> float:
+def lag_s(lead_s: float) -> float:
     """Return the mean lag of the prediction behind a uniform finger."""
-    filter_ = method(name)
     errors = [
-        filter_.predict(estimate, np.array([lead_s]))[0] - steady(estimate.at_ns * 1e-9 + lead_s)
-        for estimate in followed(filter_, steady, 600)[100:]
+        BANK.predict(estimate, np.array([lead_s]))[0] - steady(estimate.at_ns * 1e-9 + lead_s)
+        for estimate in followed(steady, 600)[100:]
     ]
     velocity = steady(1.0)
     return float(-np.mean(errors @ velocity) / (velocity @ velocity))
 
 
 def test_a_steady_finger_is_predicted_without_lag() -> None:
-    assert abs(lag_s("adaptive", 0.05)) < 1e-3
-
-
-def test_a_low_pass_lags_by_its_own_time_but_not_by_the_lead() -> None:
-    assert 1e-3 < lag_s("one_euro", 0.05) < 6e-3
-
-
-def test_a_method_without_velocity_lags_by_the_horizon() -> None:
-    filter_ = method("none")
-    last = followed(filter_, steady, 200)[-1]
-    off = steady(last.at_ns * 1e-9 + 0.05) - filter_.predict(last, np.array([0.05]))[0]
-    assert np.linalg.norm(off) > 0.9 * 0.05 * np.linalg.norm([0.1, -0.05, 0.02])
+    assert abs(lag_s(0.05)) < 1e-3
 
 
 def test_a_resting_finger_is_known_better_than_it_is_measured() -> None:
-    filter_ = method("adaptive")
-    errors = [
-        filter_.moments(estimate)[0] - still(0.0) for estimate in followed(filter_, still, 600)[60:]
-    ]
+    errors = [BANK.moments(estimate)[0] - still(0.0) for estimate in followed(still, 600)[60:]]
     assert np.sqrt(np.mean(np.square(errors))) < 0.95 * np.sqrt(np.trace(NOISE) / 3)
 
 
@@ -140,31 +115,25 @@ def test_tremor_is_predicted() -> None:
     def trembling(time_s: float) -> Floats:
         return np.array([5e-5 * np.sin(2 * np.pi * 9.3 * time_s), 0.0, 0.0])
 
-    def error_m(name: str) -> float:
-        filter_ = method(name)
-        errors = [
-            filter_.predict(one, np.array([0.02]))[0, 0] - trembling(one.at_ns * 1e-9 + 0.02)[0]
-            for one in followed(filter_, trembling, 900)[200:]
-        ]
-        return float(np.sqrt(np.mean(np.square(errors))))
-
+    errors = [
+        BANK.predict(one, np.array([0.02]))[0, 0] - trembling(one.at_ns * 1e-9 + 0.02)[0]
+        for one in followed(trembling, 900)[200:]
+    ]
     left_out_m = 5e-5 / np.sqrt(2)
-    assert error_m("adaptive") < 0.75 * left_out_m
-    assert left_out_m < error_m("one_euro") < 2.0 * left_out_m
+    assert np.sqrt(np.mean(np.square(errors))) < 0.75 * left_out_m
 
 
 def test_a_start_and_a_stop_are_followed_within_a_few_frames() -> None:
     def stop_and_go(time_s: float) -> Floats:
         return np.array([0.2 * min(max(time_s - 1.0, 0.0), 0.5), 0.0, 0.0])
 
-    filter_ = method("adaptive")
-    estimates = followed(filter_, stop_and_go, 180)
+    estimates = followed(stop_and_go, 180)
     off = [
-        np.linalg.norm(filter_.moments(one)[0] - stop_and_go(one.at_ns * 1e-9))
+        np.linalg.norm(BANK.moments(one)[0] - stop_and_go(one.at_ns * 1e-9))
         for one in estimates[30:]
     ]
     assert max(off) < 2e-3
-    assert np.linalg.norm(filter_.moments(estimates[-1])[1]) < 5e-3
+    assert np.linalg.norm(BANK.moments(estimates[-1])[1]) < 5e-3
 
 
 # The path ahead
@@ -287,15 +256,14 @@ def test_nothing_beyond_a_fingers_reach_enters(way_m: float) -> None:
 # Late and missing points
 
 
-@pytest.mark.parametrize("name", TRACKING_METHODS)
-def test_a_late_point_corrects_the_track(name: str) -> None:
+def test_a_late_point_corrects_the_track() -> None:
     """Points out of order give the same track as points in order."""
     generator = np.random.default_rng(2)
     points = [
         steady(frame * FRAME_NS * 1e-9) + 1e-5 * generator.standard_normal(3) for frame in range(40)
     ]
     order = [*range(30), 31, 32, 30, 34, 33, 35, 36, 37, 38, 39]
-    in_order, shuffled = new_tracker(name), new_tracker(name)
+    in_order, shuffled = new_tracker(), new_tracker()
     for frame in range(40):
         in_order.update(frame * FRAME_NS, points[frame], NOISE)
     late = 0
@@ -387,41 +355,3 @@ def test_half_the_frames_are_enough() -> None:
         return float(np.sqrt(np.mean(np.square(errors))))
 
     assert rms_m(2) < 2.0 * rms_m(1)
-
-
-# The family
-
-
-def wandering(time_s: float) -> Floats:
-    """Return half a millimetre at 0.6 Hz and tremor at 9.6 Hz, with a different phase per axis."""
-    phases = np.array([0.0, 1.0, 2.0])
-    slow = np.sin(2 * np.pi * 0.6 * time_s + phases)
-    quick = np.sin(2 * np.pi * 9.6 * time_s + 2 * phases)
-    return 5e-4 * slow + 3.5e-5 * quick
-
-
-def reaching(time_s: float) -> Floats:
-    return np.array([0.05 * np.sin(2 * np.pi * 0.5 * time_s), 0.0, 0.0])
-
-
-def test_methods_have_the_stated_accuracy_in_their_range() -> None:
-    """More expensive methods are better for longer horizons and more dynamic fingers."""
-    family = make_tracking_family(
-        lambda scene: {
-            "rest": TruePathCase(wandering, 6.0, resting=True),
-            "reach": TruePathCase(lambda t: reaching(t) + wandering(t), 6.0, resting=False),
-        }
-    )
-    errors: dict[tuple[str, str, int], float] = {}
-    for trial in family.trials(SCENE):
-        point = measure_trial(trial, repeats=1)
-        errors[trial.method, str(trial.case["motion"]), int(trial.case["horizon_ms"])] = point.error
-        known = trial.method != "none"
-        assert trial.in_range >= known
-        if trial.in_range and trial.case["motion"] == "rest" and trial.case["horizon_ms"] < 50:
-            assert point.error < family.tolerance(SCENE)
-    for motion, horizon_ms in (("rest", 20), ("rest", 50), ("reach", 20), ("reach", 50)):
-        best = min(TRACKING_METHODS, key=lambda name: errors[name, motion, horizon_ms])
-        assert best == "adaptive"
-    assert errors["none", "reach", 50] > 5 * errors["adaptive", "reach", 50]
-    assert errors["adaptive", "rest", 0] < errors["none", "rest", 0]

@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from flexsheet.launch.methods.configurations import CONTROL_AGAIN
 from flexsheet.launch.methods.system_picture import draw_system_chart
 from website.messages_page import format_table
 from website.sensitivity_page import METRICS
 
 SYSTEM = "system.json"
-PARTS = ("points", "front")
 DRAWN_SCENE = "cylinder"
 """The scene in the picture of the README: the demo's."""
 
@@ -21,7 +19,10 @@ DRAWN_SCENE = "cylinder"
 def draw(results: Path, images: Path) -> None:
     """Draw the recorded measurement of the demo's scene."""
     result = _read(results / SYSTEM)["results"]
-    drawn = {key: [one for one in result[key] if one["scene"] == DRAWN_SCENE] for key in PARTS}
+    drawn = {
+        key: [one for one in _select(result[key]) if one["scene"] == DRAWN_SCENE]
+        for key in ("points", "front")
+    }
     draw_system_chart(drawn, images / "system.svg")
 
 
@@ -35,9 +36,7 @@ def render_system(results: Path) -> str:
              "exceeds")  # fmt: skip
     rows = []
     record = _read(results / SYSTEM)
-    for point in record["results"]["points"]:
-        if point["configuration"] == CONTROL_AGAIN:
-            continue
+    for point in _select(record["results"]["points"]):
         cells = (
             point["scene"],
             point["configuration"],
@@ -59,9 +58,12 @@ def _format_error(point: Mapping[str, Any], key: str) -> str:
     return f"{point[key]:.2f}{spread}"
 
 
+def _select(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [one for one in points if one["configuration"] in ("paper", "tuned", "most exact")]
+
+
 def _read(path: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return record
+    return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def _format_latency(quantiles: Mapping[str, float] | None) -> str:

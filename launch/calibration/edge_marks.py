@@ -25,7 +25,7 @@ from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
-from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.marker import BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import Gate
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry
@@ -95,7 +95,6 @@ def make_detector_config() -> DetectorConfig:
             max_area_px=given.marker_max_area_px,
             window_half_px=given.window_half_px,
         ),
-        refine=MARKER_METHODS["subpixel_fit"],
         max_reprojection_px=given.max_reprojection_px,
     )
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,10 +29,8 @@ SYSTEM = "system"
 
 @app.command(
     epilog=examples(
-        "flexsheet chart tracking",
-        "flexsheet chart marker --cases",
-        "flexsheet chart marker --scene lab.yaml --json",
-        "flexsheet chart --output docs/charts --redraw",
+        "flexsheet chart correction",
+        "flexsheet chart sheet-shape --scene lab.yaml --json",
         "flexsheet chart system --scene launch/scenes/light-touch.yaml --blocks 6 --json",
     )
 )
@@ -58,14 +55,6 @@ def chart(
     output: Annotated[Path, output_file("Folder for the charts and results.", "FOLDER")] = Path(
         "runs/charts"
     ),
-    redraw: Annotated[
-        bool,
-        typer.Option("--redraw", help="Draw the results in --output again, without measuring."),
-    ] = False,
-    cases: Annotated[
-        bool,
-        typer.Option("--cases", help="Print one line per case instead of one line per method."),
-    ] = False,
     blocks: Annotated[
         int,
         typer.Option(
@@ -93,14 +82,6 @@ def chart(
             "which the errors are computed.",
         ),
     ] = 5,
-    configurations: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--configuration",
-            metavar="NAME",
-            help="For system: configuration to measure; repeat the option; default: all.",
-        ),
-    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure the computing time and error of the methods in a method family, and draw a chart.
@@ -111,90 +92,53 @@ def chart(
     interrupted measurement of `system`, repeat the command with the same --output.
     """
     logs_on_stderr()
+    from flexsheet.launch.methods.results import describe_load
+
     chosen = [find_file(one, SCENES) for one in scene_files or ()]
+    if busy := describe_load():
+        words.print(busy, style="yellow")
     if family == SYSTEM:
         from flexsheet.launch.methods.system_chart import run_system_chart
+        from flexsheet.launch.methods.system_picture import draw_system_chart
+        from flexsheet.messages.files import write_file
 
-        measure = partial(
-            run_system_chart,
-            chosen or sorted(SCENES.glob("*.yaml")),
-            output,
-            blocks=blocks,
-            seconds=seconds,
-            apparatuses=apparatuses,
-            configurations=configurations or (),
-        )
-        _measure_system(measure, output / "system.svg", as_json=as_json)
+        with progress_words() as progress:
+            result = run_system_chart(
+                chosen or sorted(SCENES.glob("*.yaml")),
+                output,
+                progress,
+                blocks=blocks,
+                seconds=seconds,
+                apparatuses=apparatuses,
+            )
+        image = output / "system.svg"
+        draw_system_chart(result, image)
+        result = replace_non_finite({**result, "picture": str(image)})
+        write_file(image.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+        if as_json:
+            print_json(result)
+        else:
+            _print_configurations(result)
+        words.print(f"chart: {image}")
         return
     from flexsheet.launch.methods import charts
-    from flexsheet.launch.methods.results import describe_load
     from flexsheet.launch.plans.plan import load_scene
 
-    if redraw:
-        stored = charts.read_charts(output)
-        results = [result for result in stored if family in (None, result["family"])]
-        if not results:
-            raise CommandError(
-                f"--output {output}: the folder contains no results to draw; measure first"
-            )
-        for result in results:
-            charts.draw_chart(result, output / f"{result['family']}.svg")
-        words.print(f"charts: {charts.write_overview(output)}")
-        if as_json:
-            print_json(results)
-        return
     if len(chosen) > 1:
         raise CommandError("--scene: only `chart system` accepts several scenes")
     scene = load_scene(chosen[0] if chosen else find_file(CYLINDER, SCENES))
-    families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
-    if busy := describe_load():
-        words.print(busy, style="yellow")
     results = []
-    for each in families:
+    for each in [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]:
         with progress_words() as progress:
-            report = partial(_report, progress, each.name)
-            points = charts.measure_family(each, scene, progress=report)
+            points = charts.measure_family(each, scene, progress=progress)
         result = replace_non_finite(charts.make_chart_result(each, scene, points))
         image, _ = charts.write_chart(result, output)
         words.print(f"chart: {image}")
         results.append(result)
         if not as_json:
-            (_print_points if cases else _print_methods)(result)
-    words.print(f"charts: {charts.write_overview(output)}")
+            _print_methods(result)
     if as_json:
         print_json(results[0] if family else results)
-
-
-def _report(progress: Callable[[str], None], family: str, text: str) -> None:
-    progress(f"{family}: {text}")
-
-
-def _measure_system(measure: Callable[..., dict[str, Any]], image: Path, *, as_json: bool) -> None:
-    """Measure latencies and errors of graph configurations, and write the results and a chart.
-
-    measure: function that measures and returns the results. It receives a function to which it
-        reports its progress.
-    """
-    import json
-
-    from flexsheet.launch.methods.results import describe_load
-    from flexsheet.launch.methods.system_picture import draw_system_chart
-    from flexsheet.messages.files import write_file
-
-    if busy := describe_load():
-        words.print(busy, style="yellow")
-    with progress_words() as progress:
-        result = measure(progress=progress)
-    draw_system_chart(result, image)
-    result = replace_non_finite({**result, "picture": str(image)})
-    write_file(image.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
-    if as_json:
-        print_json(result)
-        return
-    _print_configurations(result)
-    for one in result["failed"]:
-        words.print(f"{one['scene']}: {one['trial']} failed: {one['error']}")
-    words.print(f"chart: {image}")
 
 
 def _print_configurations(result: dict[str, Any]) -> None:
@@ -209,26 +153,19 @@ def _print_configurations(result: dict[str, Any]) -> None:
             f"{point['cpu_cores']:.2f}",
             _latency(point["exposure_to_arm_ms"]),
             _latency(point["exposure_to_light_ms"]),
-            *(_error(point, key) for key in ERRORS),
+            *(shown(point[key]) for key in ERRORS),
             "front" if (point["scene"], point["configuration"]) in front else "",
             "" if point["meets_tolerances"] else "fails: " + ", ".join(point["failing"]),
         )
         for point in result["points"]
     ]
     print_table((*columns, "", ""), rows)
+    for one in result["failed"]:
+        words.print(f"{one['scene']}: {one['trial']} failed: {one['error']}")
 
 
 def _latency(found: dict[str, float] | None) -> str:
     return "-" if found is None else f"{found['p50']:.1f} / {found['p99']:.1f}"
-
-
-def _error(point: dict[str, Any], key: str) -> str:
-    spread = point["spread"].get(f"{key}.p95")
-    if spread is None:
-        return "-"
-    if spread["low"] is None:
-        return f"{spread['value']:.3g}"
-    return f"{spread['value']:.3g} ({spread['low']:.3g}-{spread['high']:.3g})"
 
 
 def _print_methods(result: dict[str, Any]) -> None:
@@ -247,31 +184,3 @@ def _print_methods(result: dict[str, Any]) -> None:
     ]
     error = f"error, {result['unit']}"
     print_table(("method", "median", "p99", error, "outside", "cases in range", ""), rows)
-
-
-def _print_points(result: dict[str, Any]) -> None:
-    extra_names = list(
-        dict.fromkeys(name for point in result["points"] for name in point["extra_metrics"])
-    )
-    rows = [
-        (
-            point["method"],
-            ", ".join(f"{key} {_short(value)}" for key, value in point["params"].items()),
-            f"{point['median_s'] * 1e6:.1f}",
-            f"{point['p99_s'] * 1e6:.1f}",
-            shown(point["error"], ".4g"),
-            *(_short(point["extra_metrics"].get(name)) for name in extra_names),
-            "yes" if point["in_range"] else "no",
-            "front" if point["method"] in result["front"] else "",
-        )
-        for point in result["points"]
-    ]
-    error = f"error, {result['unit']}"
-    named = (name.replace("_", " ") for name in extra_names)
-    print_table(("method", "case", "median, µs", "p99, µs", error, *named, "in range", ""), rows)
-
-
-def _short(value: float | int | str | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -51,7 +51,7 @@ def make_result_folder(output: Path | None, name: str) -> Path:
 @app.command(
     epilog=examples(
         "flexsheet experiment stroke --duration 30",
-        "flexsheet experiment stroke --set triangulator.tracking=none --json",
+        "flexsheet experiment stroke --set planner.prediction_horizon_s=0 --json",
     )
 )
 def stroke(

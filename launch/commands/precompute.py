@@ -45,9 +45,10 @@ def precompute(
 ) -> None:
     """Compute the deflection shapes of a scene's sheet if the cache does not contain them.
 
-    The renderer draws a pushed sheet with these shapes. If the scene sets `sheet_force: table`, the
-    force table is also computed, which takes about two minutes. Experiments and the demo compute
-    missing shapes automatically.
+    The renderer draws a pushed sheet with these shapes. If the object has a material, the table of
+    the sheet's force is also computed, which takes about two minutes. The package contains the
+    table for the sheet of the shipped scenes. Experiments and the demo compute missing shapes
+    automatically.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.running.precompute import (
@@ -67,7 +68,7 @@ def precompute(
     with progress_words() as progress:
         files = {"deflection_shapes": precompute_deflection_shapes(scene, cache, progress)}
         load_or_compute_bounds(scene.camera.rate_hz, cache, progress)
-        if scene.methods.sheet_force == "table":
+        if scene.object.material is not None:
             files["force_table"] = precompute_force_table(scene, cache, progress)
         if skin_spacing_m is not None:
             try:

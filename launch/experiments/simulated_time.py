@@ -54,7 +54,6 @@ from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import update_horizon_s
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
-from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import (
@@ -141,9 +140,7 @@ class MeasuredFinger:
         self._left_from_world = inverse(pose_matrix(self._camera.world_from_left))
         self._random = np.random.default_rng(settings.seed)
         speed_m_per_s = scene.finger.max_speed_m_per_s
-        self._tracker = Tracker(
-            TRACKING_METHODS["adaptive"](speed_m_per_s), TrackingSettings(speed_m_per_s)
-        )
+        self._tracker = Tracker(TrackingSettings(speed_m_per_s))
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:

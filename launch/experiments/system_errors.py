@@ -32,7 +32,6 @@ from flexsheet.launch.experiments.stroke import (
     project_presented_point,
 )
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
-from flexsheet.launch.methods.blocks import attribute_error
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.methods import Methods, SoftBodyChoice, SoftBodyMethod
 from flexsheet.messages.scene import Scene
@@ -45,10 +44,9 @@ from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
-from flexsheet.nodes.planner.force_table import load_force_model
+from flexsheet.nodes.planner.force_table import choose_force_model
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
 from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
@@ -137,9 +135,9 @@ class ErrorEvaluator:
         planner: values of further planner parameters, by parameter name.
         """
         has_image, has_force = self.scene.projector is not None, self.scene.object.material
-        moving = (methods.marker, methods.tracking, *planner.items())
+        moving = tuple(planner.items())
         drawn = (methods.correction, methods.sheet_shape)
-        pressed = (methods.sheet_force, methods.soft_body, methods.compliance)
+        pressed = (methods.soft_body, methods.compliance)
         return {
             **self._once(moving, lambda: self._stroke(methods, planner)),
             "image_mm": self._once(drawn, lambda: self._image(methods)) if has_image else None,
@@ -225,13 +223,9 @@ class RestingPush:
 
         scene: scene with the methods of the configuration. body: undeformed soft body.
         """
-        settings, force = PlannerParameters(), scene.methods.sheet_force
+        settings = PlannerParameters()
         mode = settings.choose_compliance(scene)
-        model = (
-            load_force_model(scene, force or "scaled", None)[0]
-            if calibrations.sheet is None
-            else make_force_model(scene.sheet, calibrations.sheet)
-        )
+        model, _ = choose_force_model(scene, calibrations.sheet)
         bounds = load_or_compute_bounds(scene.camera.rate_hz, None)
         self._controller = ComplianceController(
             scene, model, mode, bounds=bounds if mode == "force_curve" else None
@@ -316,6 +310,22 @@ def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: A
     fingertip = wanted - aimed
     control = aimed - present(recording.measured_edges, measured_foot, recording.surface)
     return np.stack([fingertip, control, whole - fingertip - control])
+
+
+def attribute_error(parts: Floats) -> Floats:
+    """Return how much each of k error components contributes to the mean square error.
+
+    The contributions (k,) are fractions that add up to one. A contribution is negative if the
+    component partly cancels other components.
+
+    parts: error components (k, n, d), each with n vectors of d dimensions. Their sum is the total
+        error.
+    """
+    whole = parts.sum(axis=0)
+    total = float(np.square(whole).sum())
+    if total == 0.0:
+        return np.zeros(len(parts))
+    return np.asarray(np.einsum("knd,nd->k", parts, whole) / total)
 
 
 def summarize_errors(values: Floats) -> dict[str, float] | None:

@@ -229,7 +229,6 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     law, _ = choose_force_model(
         scene,
         None if calibration is None else SheetCalibration.load(calibration),
-        given.sheet_force,
         given.cache_dir,
     )
     fixed_s = given.prediction_horizon_s

@@ -11,12 +11,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.methods import SheetForceMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.nodes.cache import Specification, advise_precompute, cached, load_cached
@@ -97,36 +96,19 @@ def compute_table(
 
 
 def choose_force_model(
-    scene: Scene,
-    calibration: SheetCalibration | None,
-    method: SheetForceMethod | Literal["auto"] = "auto",
-    cache_dir: Path | None = None,
+    scene: Scene, calibration: SheetCalibration | None, cache_dir: Path | None = None
 ) -> tuple[SheetForceModel, str]:
     """Return the force model that the planner uses for a scene, and a note for the operator.
 
-    calibration: calibration of the sheet, which replaces the method; None: not calibrated.
-    method: "auto" stands for the method of the scene.
+    calibration: calibration of the sheet, which replaces the computed table; None: not calibrated.
+
+    If neither the cache nor the package contains the table, a `ScaledSheetModel` is returned.
     """
     if calibration is not None:
         return make_force_model(scene.sheet, calibration), "calibrated"
-    chosen: SheetForceMethod = resolve_method(method, scene.methods.sheet_force, "scaled")
-    return load_force_model(scene, chosen, cache_dir)
-
-
-def load_force_model(
-    scene: Scene, method: SheetForceMethod, cache_dir: Path | None
-) -> tuple[SheetForceModel, str]:
-    """Return the force model of an uncalibrated sheet, and a note for the operator.
-
-    If the method is "table" but neither the cache nor the package contains the table, a
-    `ScaledSheetModel` is returned.
-    """
-    rubber = make_rubber(scene.sheet)
-    if method != "table":
-        return ScaledSheetModel(rubber), method
     entry = make_table_cache(scene)
     table = load_cached(entry, cache_dir) or load_cached(entry, FOLDER)
-    if table is None:
-        note = f"scaled; the table of the sheet's force is missing; {advise_precompute(scene)}"
-        return ScaledSheetModel(rubber), note
-    return table, method
+    if table is not None:
+        return table, "table"
+    note = f"scaled; the table of the sheet's force is missing; {advise_precompute(scene)}"
+    return ScaledSheetModel(make_rubber(scene.sheet)), note

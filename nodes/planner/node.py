@@ -94,7 +94,7 @@ class Planner(Node):
         self._trajectory = self._compliance = None
         self._trajectory = SheetTrajectoryPlanner(scene, self.parameters)
         model, self._model_text = choose_force_model(
-            scene, self._calibration, self.parameters.sheet_force, self.parameters.cache_dir
+            scene, self._calibration, self.parameters.cache_dir
         )
         measured = None if self._calibration is None else self._calibration.hysteresis_ratio
         mode = self.parameters.choose_compliance(scene)

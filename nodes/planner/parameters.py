@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from flexsheet.messages.methods import ComplianceMode, SheetForceMethod, resolve_method
+from flexsheet.messages.methods import ComplianceMode, resolve_method
 from flexsheet.messages.scene import NonNegative, Positive, Scene
 from flexsheet.nodes.models.motion import SheetBounds
 from flexsheet.nodes.node import NodeParameters
@@ -55,11 +55,6 @@ class PlannerParameters(NodeParameters):
         default=None,
         description="calibration file from `flexsheet calibrate sheet`; null: the sheet is "
         "modelled as ideal rubber with the modulus in the scene",
-    )
-    sheet_force: SheetForceMethod | Literal["auto"] = Field(
-        default="auto",
-        description="force model of the sheet if no calibration is given; auto: the model in the "
-        "scene's methods, otherwise scaled",
     )
     cache_dir: Path | None = Field(
         default=None,

@@ -47,7 +47,6 @@ CORRECTION_OF: dict[str, Correction] = {
     TWO_PASS_TRIANGLES: "two_pass",
 }
 METHODS = tuple(CORRECTION_OF)
-WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
 CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
@@ -59,21 +58,20 @@ STRETCH = 1.05
 SPACING_M = 0.0025
 
 
-def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
+def correction_family(reference: ReferenceFactory) -> Family:
     """Define the benchmark of all image correction methods for tilted and pushed sheets.
 
     The cases are those of figures 11 and 13 in Furukawa et al. 2007. Further cases are at the
     limits of the scene's working range.
 
     reference: function that computes the reference sheet of a case.
-    solved: whether to include methods that need precomputed deflection shapes.
     """
     return Family(
         name="correction",
         unit="mm",
         reference="rms error at the points that the eye sees on the simulated sheet",
-        methods=METHODS if solved else WITHOUT_SHAPES,
-        trials=partial(_trials, reference, solved),
+        methods=METHODS,
+        trials=partial(_trials, reference),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
@@ -155,8 +153,8 @@ def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
     return scene.model_copy(update={"projector": projector.model_copy(update=size)})
 
 
-def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
-    basis = deflection_cache.load_or_compute(scene, None) if solved else None
+def _trials(reference: ReferenceFactory, scene: Scene) -> Iterator[Trial]:
+    basis = deflection_cache.load_or_compute(scene, None)
     context = headless_context()
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
     for size in SIZES_PX:
@@ -176,7 +174,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
                 shown, reference, tilt_deg=tilt_deg, push_mm=push_mm
             )
             in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
-            for method in METHODS if solved else WITHOUT_SHAPES:
+            for method in METHODS:
                 yield Trial(
                     method=method,
                     case=case,

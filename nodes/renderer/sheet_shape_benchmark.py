@@ -32,8 +32,7 @@ ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
 """A function that returns world points (n, 3), in m, of the reference sheet. Its arguments are the
 scene, the poses (4, 4) of the sheet's left and right edges, and the fingertip (3,), m."""
 
-WITHOUT_SHAPES = ("four_triangles",)
-METHODS = (*WITHOUT_SHAPES, "reduced_order", "membrane")
+METHODS = ("four_triangles", "reduced_order", "membrane")
 DEPTHS_M = (0.002, 0.01, 0.02, 0.035, 0.05)
 SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
@@ -45,23 +44,20 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
 sheet's centre, as fractions of the sheet's width and height."""
 
 
-def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return the benchmark of the sheet shape methods for several stretches, depths and positions.
-
-    solved: whether to include the methods that need precomputed deflection shapes.
-    """
+def sheet_shape_family(reference: ReferenceFactory) -> Family:
+    """Return the benchmark of the sheet shape methods by stretch, depth and position."""
     return Family(
         name="sheet-shape",
         unit="mm",
         reference="the simulated membrane, rms height",
-        methods=METHODS if solved else WITHOUT_SHAPES,
-        trials=partial(_trials, reference, solved),
+        methods=METHODS,
+        trials=partial(_trials, reference),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
 
-def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
-    basis = deflection_cache.load_or_compute(scene, None) if solved else None
+def _trials(reference: ReferenceFactory, scene: Scene) -> Iterator[Trial]:
+    basis = deflection_cache.load_or_compute(scene, None)
     rubber, _ = deflection_cache.required_shapes(scene)
     spec = scene.sheet
     middle = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio)
@@ -88,23 +84,23 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
             rows, columns = pushed.rest_m.shape[:2]
             return SheetMesh(pushed.positions[0].reshape(-1, 3), triangulate_grid(rows, columns))
 
-        shapes: dict[str, Callable[[SheetPose], SheetMesh]] = {"four_triangles": pyramid_mesh}
-        in_range = {"four_triangles": depth <= MAX_TRIANGLES_DEPTH_M}
-        if basis is not None:
-            shapes |= {"reduced_order": partial(deflected_mesh, basis=basis), "membrane": elements}
-            in_range |= {
-                "reduced_order": not basis.invalid_reason(stretch, position, depth),
-                "membrane": True,
-            }
+        shapes: dict[str, tuple[Callable[[SheetPose], SheetMesh], bool]] = {
+            "four_triangles": (pyramid_mesh, depth <= MAX_TRIANGLES_DEPTH_M),
+            "reduced_order": (
+                partial(deflected_mesh, basis=basis),
+                not basis.invalid_reason(stretch, position, depth),
+            ),
+            "membrane": (elements, True),
+        }
         truth = reference(scene, *edges, tip)
         case: Case = {"stretch": stretch, "depth_mm": 1e3 * depth, "position": where}
-        for method, shape in shapes.items():
+        for method, (shape, in_range) in shapes.items():
             yield Trial(
                 method=method,
                 case=case,
                 run=partial(shape, sheet),
                 error=partial(height_error_mm, truth=truth),
-                in_range=in_range[method],
+                in_range=in_range,
                 size={"triangles": len(shape(sheet).triangles)} if method != "membrane" else {},
             )
 

@@ -15,14 +15,12 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuroTracking, Unfiltered
 
 Model = tuple[float, float, float, float]
 """The parameters of a motion model. The first two are the spectral densities of the acceleration
@@ -340,7 +338,7 @@ def combine(covariance: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class BankEstimate(Estimate):
+class BankEstimate:
     """The estimate of a filter bank at one time: the states (models, 5, 3), and their weights.
 
     The prediction errors are measured at h horizons, SCORED_HORIZONS_S.
@@ -362,6 +360,9 @@ class BankEstimate(Estimate):
     velocity_variance: error variance (3,), m^2/s^2, of the velocity along the axes.
     """
 
+    at_ns: int
+    state: Floats
+    covariance: Floats
     axes: Floats
     points: int
     past_ns: tuple[int, ...]
@@ -407,9 +408,8 @@ class AdaptiveBank:
         )
 
     def update(
-        self, before: Estimate, at_ns: int, measured: Floats, covariance: Floats
+        self, before: BankEstimate, at_ns: int, measured: Floats, covariance: Floats
     ) -> BankEstimate:
-        assert isinstance(before, BankEstimate)
         before, variances = _align(before, covariance)
         dt, points = (at_ns - before.at_ns) * 1e-9, before.points + 1
         forgotten = max(_forget(dt, MEMORY_S, MEMORY_POINTS), 1.0 / (PRIOR_POINTS + points))
@@ -465,8 +465,7 @@ class AdaptiveBank:
             velocity_variance=expected / max(dt, MIN_INTERVAL_S) ** 2,
         )
 
-    def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
-        assert isinstance(estimate, BankEstimate)
+    def moments(self, estimate: BankEstimate) -> tuple[Floats, Floats, Floats]:
         axes, full = estimate.axes, np.zeros((6, 6))
         full[:3, :3] = (axes * estimate.variance) @ axes.T
         full[3:, 3:] = (axes * estimate.velocity_variance) @ axes.T
@@ -474,8 +473,7 @@ class AdaptiveBank:
         velocity = (estimate.weights[0].T * velocities).sum(axis=0)
         return axes @ estimate.position, axes @ velocity, full
 
-    def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:
-        assert isinstance(estimate, BankEstimate)
+    def predict(self, estimate: BankEstimate, horizons_s: Floats) -> Floats:
         horizons = horizons_s.tobytes()
         weighted = estimate.weights.transpose(0, 2, 1)[:, :, None] * estimate.state
         paths = np.empty((len(weighted) + 1, len(horizons_s), 3))
@@ -564,12 +562,3 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
         velocity_variance=mix @ estimate.velocity_variance,
     )
     return rotated, variances
-
-
-TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
-    "none": Unfiltered,
-    "one_euro": OneEuroTracking,
-    "adaptive": AdaptiveBank,
-}
-"""The functions that create the filter of each tracking method. The argument is the maximum speed
-of the finger (m/s)."""

@@ -7,7 +7,6 @@ import numpy as np
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, FingertipReason
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import Tracker, make_horizons_s
 
@@ -20,10 +19,7 @@ class ExternalFingertip:
 
     def __init__(self, scene: Scene, noise_m: float) -> None:
         limits, max_speed_m_per_s = TriangulatorParameters(), scene.finger.max_speed_m_per_s
-        method = TRACKING_METHODS[scene.methods.tracking or "adaptive"]
-        self._tracker = Tracker(
-            method(max_speed_m_per_s), limits.tracking_settings(max_speed_m_per_s)
-        )
+        self._tracker = Tracker(limits.tracking_settings(max_speed_m_per_s))
         self._volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
         self._covariance = np.eye(3) * noise_m**2
         self._horizons_s = make_horizons_s(limits.prediction_horizon_s)

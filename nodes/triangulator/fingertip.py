@@ -17,15 +17,15 @@ from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.flat_marker import DiscView, FlatPose, estimate_flat_pose
 from flexsheet.nodes.triangulator.marker import (
-    FLAT_METHODS,
     SHARP_PX,
     Blob,
     BlobFilter,
     Marker,
-    Refine,
     Window,
     detect_blobs,
+    fit_flat_markers,
     is_overexposed,
+    subpixel_fit,
     window_around,
 )
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
@@ -88,16 +88,14 @@ class DetectorConfig:
     """The settings for the detection, refinement and triangulation of markers.
 
     blob_filter: criteria for a blob that may be the marker.
-    refine: function that implements the selected refinement method.
     max_reprojection_px: maximum reprojection error of a pair.
-    noise_px: standard deviation of a marker's centre; None to use the estimate of `refine`.
+    noise_px: standard deviation of a marker's centre; None to use the estimate of the fit.
     marker_radius_m: true radius of the marker.
     max_deviation_m: maximum standard deviation of a triangulated point.
     sensor: noise of the pixels.
     """
 
     blob_filter: BlobFilter
-    refine: Refine
     max_reprojection_px: float
     noise_px: float | None = None
     marker_radius_m: float = 0.003
@@ -399,12 +397,9 @@ def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[Refi
 
 
 def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> list[RefinedPair]:
-    refine = FLAT_METHODS.get(inputs.config.refine)
-    if refine is None:
-        return []
     pairs = [one.pair for one in rejected]
     found = []
-    for pair, markers in zip(pairs, _refine_markers(inputs, pairs, refine), strict=True):
+    for pair, markers in zip(pairs, _refine_markers(inputs, pairs, flat=True), strict=True):
         if any(marker.rejection_reason is not None for marker in markers):
             continue
         flat = _check_flat_pair(inputs, markers)
@@ -494,17 +489,13 @@ def _appearance(pair: BlobPair) -> Floats:
 
 
 def _refine_markers(
-    inputs: DetectionInput, pairs: Sequence[BlobPair], refine: Refine | None = None
+    inputs: DetectionInput, pairs: Sequence[BlobPair], *, flat: bool = False
 ) -> list[tuple[Marker, Marker]]:
-    """Refine the markers of all pairs in one call.
-
-    refine: function that refines the markers; None to use the configured method.
-    """
-    config = inputs.config
+    """Refine the markers of all pairs in one call, as discs or as flat markers."""
     images = [image for _ in pairs for image in inputs.images]
     blobs = [blob for pair in pairs for blob in (pair.left, pair.right)]
-    refine = config.refine if refine is None else refine
-    markers = refine(images, blobs, config.sensor)
+    refine = fit_flat_markers if flat else subpixel_fit
+    markers = refine(images, blobs, inputs.config.sensor)
     return list(zip(markers[::2], markers[1::2], strict=True))
 
 

@@ -2,14 +2,14 @@
 
 Pixel coordinates have their origin at the centre of the top left pixel, with x to the right and y
 down. A marker is a small bright disc, blurred by its motion during the exposure. `detect_blobs`
-finds all bright blobs that have about the size of a marker. A refinement method then computes the
+finds all bright blobs that have about the size of a marker. `subpixel_fit` then computes the
 centres of the likely blobs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -129,11 +129,6 @@ class Marker:
     height: float
     rejection_reason: MarkerRejection | None
     elongation: tuple[float, float] = (0.0, 0.0)
-
-
-Refine = Callable[[Sequence[Image], Sequence[Blob], PixelNoise], list[Marker]]
-"""A function that refines blobs to markers. It receives one image per blob, the blobs, and the
-noise of the pixels."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
@@ -302,67 +297,10 @@ MAX_SPREAD = 1.7
 """The maximum value of `Blob.spread`. A blob with a larger spread is not a marker."""
 
 
-@dataclass(frozen=True, slots=True)
-class SystematicError:
-    """The errors of a refinement method that do not come from image noise, in each image direction.
-
-    still_px: standard deviation of the error that the pixel grid and an uneven background cause,
-        px.
-    moving: standard deviation of the additional error of a moving marker, as a fraction of its
-        motion during the exposure.
-    """
-
-    still_px: float
-    moving: float
-
-    def covariance(self, motion: tuple[float, float]) -> Floats:
-        """Return the covariance (2, 2), px^2, of the systematic error.
-
-        motion: motion (x, y) of the marker during the exposure, px.
-        """
-        variance = self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
-        return np.array([[variance, 0.0], [0.0, variance]])
-
-
-BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
-"""The systematic error of the method `moments`, as measured in simulations
-(`tests/test_marker.py`)."""
-
-BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""The systematic error of the method `subpixel_fit`, as measured in simulations
-(`tests/test_marker.py`)."""
-
-
-def moments(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
-    """Refine each blob's centre to the unweighted centroid of its brighter pixels.
-
-    A pixel is used if its grey level is above the mean of `Blob.peak` and `Blob.surround`.
-    """
-    markers = []
-    for image, blob in zip(images, blobs, strict=True):
-        level = 0.5 * (blob.surround + blob.peak)
-        bright = cv2.threshold(image[blob.window], level, 1, cv2.THRESH_BINARY)[1]
-        found = cv2.moments(bright, binaryImage=True)
-        rejection_reason: MarkerRejection | None = None
-        if blob.spread > MAX_SPREAD:
-            rejection_reason = "blurred"
-        if math.hypot(*blob.motion) > MAX_MOTION_PX:
-            rejection_reason = "merged"
-        rows, columns = blob.window
-        x, y = found["m10"] / found["m00"], found["m01"] / found["m00"]
-        markers.append(
-            Marker(
-                centre=np.array([columns.start + x, rows.start + y]),
-                covariance=BY_MOMENTS.covariance(blob.motion),
-                radius=blob.radius,
-                radius_deviation=0.1,
-                blur=blob.blur,
-                motion=blob.motion,
-                height=blob.height,
-                rejection_reason=rejection_reason,
-            )
-        )
-    return markers
+STILL_ERROR_PX, MOVING_ERROR = 0.004, 0.005
+"""The standard deviations of the errors of a fitted centre that do not come from image noise, in
+each image direction: for a marker at rest (px), and as a fraction of the motion during the exposure
+(`tests/test_marker.py` measures them in simulations)."""
 
 
 def subpixel_fit(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
@@ -389,9 +327,10 @@ def _make_marker(
     is_merged: whether to reject the marker because it is merged with another spot.
     """
     rejection_reason: MarkerRejection | None = "blurred" if is_blurred else None
+    variance = STILL_ERROR_PX**2 + (MOVING_ERROR * math.hypot(*motion)) ** 2
     return Marker(
         centre=fit.centre,
-        covariance=fit.covariance + BY_SUBPIXEL_FIT.covariance(motion),
+        covariance=fit.covariance + np.array([[variance, 0.0], [0.0, variance]]),
         radius=fit.radius,
         radius_deviation=0.02,
         blur=fit.blur,
@@ -437,13 +376,3 @@ def _fit_starts(blobs: Sequence[Blob]) -> list[DiscStart]:
         DiscStart(blob.centre, blob.radius, blob.blur, blob.peak, blob.surround, blob.motion)
         for blob in blobs
     ]
-
-
-MARKER_METHODS: dict[str, Refine] = {
-    "moments": moments,
-    "subpixel_fit": subpixel_fit,
-}
-
-FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""The function that refines flat markers, for each refinement method. A method that has no entry
-detects only round markers."""

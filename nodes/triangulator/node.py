@@ -18,7 +18,6 @@ from flexsheet.messages.marker_calibration import (
     MarkerCalibration,
     refuse_other_marker,
 )
-from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
@@ -30,14 +29,13 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
-from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.data_association import DataAssociation
 from flexsheet.nodes.triangulator.fingertip import (
     DetectorConfig,
     StereoDetection,
     detect_all,
 )
-from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.marker import BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
 from flexsheet.nodes.triangulator.skew import compensate_skew
@@ -120,10 +118,6 @@ class Triangulator(Node):
             scene.finger.volume_max_m + self.pad_to_marker_m,
         )
         self.reasons: Counter[FingertipReason] = Counter()
-        marker = resolve_method(p.marker, scene.methods.marker, "subpixel_fit")
-        tracking = resolve_method(p.tracking, scene.methods.tracking, "adaptive")
-        self.methods = f"{marker}, {tracking}"
-        self.filter = TRACKING_METHODS[tracking](scene.finger.max_speed_m_per_s)
         self.config = DetectorConfig(
             blob_filter=BlobFilter(
                 min_contrast=p.marker_min_contrast,
@@ -131,7 +125,6 @@ class Triangulator(Node):
                 max_area_px=p.marker_max_area_px,
                 window_half_px=p.window_half_px,
             ),
-            refine=MARKER_METHODS[marker],
             noise_px=p.marker_noise_px,
             marker_radius_m=p.marker_radius_m,
             max_reprojection_px=p.max_reprojection_px,
@@ -244,10 +237,9 @@ class Triangulator(Node):
 
     def _restart(self, epoch: int) -> None:
         self.epoch = epoch
-        self.tracker = Tracker(self.filter, self.tracking)
+        self.tracker = Tracker(self.tracking)
         self.association = DataAssociation()
 
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
-        late = f"image pairs dropped as late: {self.late}"
-        self.set_note(NoteCode.INFO, f"{counts}; {late}; methods: {self.methods}")
+        self.set_note(NoteCode.INFO, f"{counts}; image pairs dropped as late: {self.late}")

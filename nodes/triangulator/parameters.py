@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
-from flexsheet.messages.methods import MarkerMethod, TrackingMethod
 from flexsheet.messages.scene import Finite, Positive
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import CameraCalibrationFile, MarkerCalibrationFile
@@ -26,15 +25,10 @@ class TriangulatorParameters(NodeParameters):
         description="calibration file from `flexsheet calibrate marker`; null: "
         "finger.marker_from_pad_m of the scene is used",
     )
-    marker: MarkerMethod | Literal["auto"] = Field(
-        default="auto",
-        description="method that refines the marker's centre; auto: the method in the scene is "
-        "used, or subpixel_fit if the scene names none",
-    )
     marker_noise_px: Positive | None = Field(
         default=None,
-        description="standard deviation of a marker's centre, px; null: the estimate of the method "
-        "that refines it is used",
+        description="standard deviation of a marker's centre, px; null: the estimate of the fit is "
+        "used",
     )
     marker_radius_m: Positive = Field(
         default=0.003, description="true radius of the marker (ball or flat disc), m"
@@ -55,11 +49,6 @@ class TriangulatorParameters(NodeParameters):
     )
     window_half_px: Annotated[int, Field(ge=8)] = Field(
         default=16, description="half the side of the smallest search window, px"
-    )
-    tracking: TrackingMethod | Literal["auto"] = Field(
-        default="auto",
-        description="tracking method that filters and predicts the fingertip; auto: the method "
-        "in the scene is used, or adaptive if the scene names none",
     )
     max_acceleration_m_per_s2: Positive = Field(
         default=60.0,

@@ -1,6 +1,6 @@
 """Track the finger: accept or reject measured points, and predict the motion.
 
-A track is the sequence of accepted points. A filter (module `filters` or `adaptive`) estimates the
+A track is the sequence of accepted points. A filter (module `adaptive`) estimates the
 motion. The gate is the region in which the next point is expected.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from flexsheet.messages.types import Fingertip, FingertipReason, FingertipState
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.triangulator.filters import Estimate, Filter
+from flexsheet.nodes.triangulator.adaptive import AdaptiveBank, BankEstimate
 
 GateResult = Literal["ok", "too_fast", "unconfirmed"]
 """The possible results of adding a measured point to a tracker.
@@ -111,15 +111,15 @@ INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
 class Tracker:
     """A tracker that filters the measured positions of one marker and predicts its path."""
 
-    def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
-        self.filter, self.settings = filter_, settings
-        self._history: list[tuple[PositionMeasurement, Estimate]] = []
+    def __init__(self, settings: TrackingSettings) -> None:
+        self.filter, self.settings = AdaptiveBank(settings.max_speed_m_per_s), settings
+        self._history: list[tuple[PositionMeasurement, BankEstimate]] = []
         self._tentative_track: list[PositionMeasurement] = []
         self._late: list[PositionMeasurement] = []
-        self._gate: tuple[tuple[PositionMeasurement, Estimate], int, Gate] | None = None
+        self._gate: tuple[tuple[PositionMeasurement, BankEstimate], int, Gate] | None = None
 
     @property
-    def estimate(self) -> Estimate | None:
+    def estimate(self) -> BankEstimate | None:
         """Return the newest estimate, even if the track is lost, or None before the first point."""
         return self._history[-1][1] if self._history else None
 
@@ -150,7 +150,9 @@ class Tracker:
             self._gate = newest, at_ns, self._gate_after(*newest, at_ns)
         return self._gate[2]
 
-    def _gate_after(self, measurement: PositionMeasurement, estimate: Estimate, at_ns: int) -> Gate:
+    def _gate_after(
+        self, measurement: PositionMeasurement, estimate: BankEstimate, at_ns: int
+    ) -> Gate:
         dt = (at_ns - estimate.at_ns) * 1e-9
         point = self.filter.predict(estimate, np.array([dt]))[0]
         spread = self.filter.moments(estimate)[2]

@@ -5,8 +5,8 @@ The inputs of a model are depths of a fingertip below the flat sheet, and a `She
 sheet (x and y from the sheet's centre, m). The outputs are the normal force, its derivative with
 respect to depth, and the force on each clamp.
 
-There are three models. From the fastest to the slowest, they are `ScaledSheetModel`,
-`nodes.models.sheet.tabulated.TabulatedSheetModel` and `MembraneSheetModel`.
+`nodes.models.sheet.tabulated.TabulatedSheetModel` is exact. It multiplies the closed form
+`ScaledSheetModel` by ratios of a table, which is computed by finite elements, or measured.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Protocol
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.sheet.membrane import CELLS, push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tension import edge_force_n, strain_measure
 
@@ -248,50 +247,6 @@ class ScaledSheetModel:
         if x > 0.5 or y > 0.76:
             return "the position is too close to an edge"
         return _invalid_sizes(rubber, push.finger_radius_m)
-
-
-@dataclass(frozen=True, slots=True)
-class MembraneSheetModel:
-    """A finite-element membrane model of the sheet's force. This force model is the most accurate.
-
-    One evaluation takes seconds.
-
-    cells: number of elements along each side of the sheet.
-    """
-
-    rubber: Rubber
-    cells: int = CELLS
-    name: str = "membrane"
-
-    def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
-        depths = _check_depths(depths_m)
-        solved_depths = np.unique(np.concatenate([depths, _SLOPE_FRACTION * depths]))
-        path = push_path(
-            self.rubber,
-            stretch_ratio=push.stretch_ratio,
-            depths_m=solved_depths,
-            position_m=push.position_m,
-            finger_radius_m=push.finger_radius_m,
-            cells=self.cells,
-        )
-        at = np.searchsorted(solved_depths, depths)
-        shallower = path.forces_n[np.searchsorted(solved_depths, _SLOPE_FRACTION * depths)]
-        rise = path.forces_n[at] - shallower
-        run = np.where(depths > 0.0, (1.0 - _SLOPE_FRACTION) * depths, 1.0)
-        return SheetForce(path.forces_n[at], rise / run, path.edge_forces_n[at])
-
-    def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
-        if depth_m < 0.2 * push.finger_radius_m:
-            return "the contact is smaller than a mesh cell"
-        x, y = relative_position(self.rubber, push.stretch_ratio, push.position_m)
-        return "" if x <= 0.8 and y <= 0.9 else "the fingertip overlaps an edge"
-
-
-_SLOPE_FRACTION = 0.96
-"""The ratio of a second, smaller push depth to the depth of a push.
-
-The force at both depths determines the stiffness.
-"""
 
 
 def depth_for_force(
