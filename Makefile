@@ -45,8 +45,8 @@ $(DEV_STAMP): requirements-dev.lock $(STAMP)
 lock:  ## write all lock files again, after a change of dependencies
 	$(PYTHON) -m venv $(LOCK)
 	$(LOCK)/bin/pip install --quiet --disable-pip-version-check pip-tools
-	$(call compile,--all-build-deps --extra export,requirements.lock,pyproject.toml)
-	$(call compile,--all-build-deps --extra export --extra ros2 --extra parquet --extra dev,requirements-dev.lock,pyproject.toml)
+	$(call compile,--all-build-deps --extra all,requirements.lock,pyproject.toml)
+	$(call compile,--all-build-deps --extra all --extra ros2 --extra dev,requirements-dev.lock,pyproject.toml)
 	$(call compile,,website/requirements.lock,website/requirements.in)
 
 compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) \

@@ -20,7 +20,7 @@ from typer.main import get_command
 
 from flexsheet.launch.commands.options import name_values
 from flexsheet.launch.commands.output import FAILED, examples, words
-from flexsheet.messages.errors import FlexsheetError, describe_error
+from flexsheet.messages.errors import FlexsheetError, describe_error, find_missing_extra
 from flexsheet.messages.files import DISK_ERRORS, make_write_error
 
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -181,4 +181,5 @@ def exit_code(error: Exception) -> int | None:
     """
     if isinstance(error, FlexsheetError):
         return error.exit_code
-    return FAILED if isinstance(error, OSError) and error.errno in DISK_ERRORS else None
+    is_disk_error = isinstance(error, OSError) and error.errno in DISK_ERRORS
+    return FAILED if is_disk_error or find_missing_extra(error) else None

@@ -4,6 +4,22 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+EXTRAS = {
+    "cyclonedds": "ros2",
+    "distributed": "cluster",
+    "foxglove": "view",
+    "glfw": "projector",
+    "matplotlib": "charts",
+    "moderngl": "projector",
+    "pyrealsense2": "realsense",
+    "rosbags": "ros2",
+    "trimesh": "meshes",
+    "viser": "console",
+    "websockets": "console",
+    "yourdfpy": "urdf",
+}
+"""The optional dependencies of pyproject.toml (extras) that install each module."""
+
 
 class FlexsheetError(Exception):
     """The base class of errors that a user can correct.
@@ -23,7 +39,16 @@ class FlexsheetError(Exception):
         return Exception.__str__(self)
 
 
+def find_missing_extra(error: Exception) -> str | None:
+    """Return the extra whose packages are missing if the error is a failed import of one."""
+    if not isinstance(error, ModuleNotFoundError) or error.name is None:
+        return None
+    return EXTRAS.get(error.name.partition(".")[0])
+
+
 def describe_error(error: Exception) -> str:
     """Return the text of an error and the remedy of its class, separated by a full stop."""
+    if extra := find_missing_extra(error):
+        return f"{error}. Install it: pip install 'flexsheet[{extra}]'"
     text, remedy = str(error), getattr(error, "remedy", "")
     return f"{text.removesuffix('.')}. {remedy}" if remedy else text

@@ -46,7 +46,7 @@ from pydantic import ConfigDict
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
-from flexsheet.messages.errors import FlexsheetError, describe_error
+from flexsheet.messages.errors import FlexsheetError, describe_error, find_missing_extra
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.notes import Note, NoteCode
 from flexsheet.messages.scene import Scene
@@ -546,8 +546,13 @@ class Node:
         """
         self.errors += 1
         self.last_error = f"{what}: {type(error).__name__}: {describe_error(error)}"
-        trace = None if isinstance(error, FlexsheetError) else error
-        self.log.error("handler failed", what=what, error=str(error), exc_info=trace)
+        explained = isinstance(error, FlexsheetError) or find_missing_extra(error)
+        self.log.error(
+            "handler failed",
+            what=what,
+            error=describe_error(error),
+            exc_info=None if explained else error,
+        )
 
     def is_superseded(self, port: str) -> bool:
         """Return whether a newer message waits for the coroutine handler of a port.

@@ -29,6 +29,7 @@ from pydantic import BaseModel, ConfigDict
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import BusError, MessageFilter, Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.errors import describe_error
 from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import Delivery, Topic, find_topic
@@ -414,7 +415,7 @@ async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
         except Exception as error:
             # The launcher sees only the exit code, so the reason must be logged here.
             structlog.get_logger().error(
-                "node failed", node=node.name, error=str(error), exc_info=True
+                "node failed", node=node.name, error=describe_error(error), exc_info=True
             )
             raise LoggedNodeError(node.name) from error
         finally:

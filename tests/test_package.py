@@ -10,11 +10,13 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 import flexsheet
+from flexsheet.messages.errors import EXTRAS, describe_error
 from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -116,3 +118,32 @@ def test_the_launcher_loads_no_numerical_library_of_the_nodes() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_required_packages_are_few_and_each_optional_module_has_an_extra() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert len(project["dependencies"]) <= 14
+    assert set(EXTRAS.values()) <= set(project["optional-dependencies"])
+
+
+OPTIONAL = sorted(EXTRAS)
+ARM_COMPUTER = """
+import sys
+sys.modules.update(dict.fromkeys(sys.argv[1:]))
+from pathlib import Path
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.nodes import node_class
+plan = load_graph(Path("{file}"))
+for node in plan.nodes_on("left"):
+    node_class(node.type)
+"""
+
+
+def test_the_computer_of_an_arm_needs_no_optional_package(tmp_path: Path) -> None:
+    code = ARM_COMPUTER.format(file=ROOT / "launch" / "lab.yaml")
+    run_python(f"import sys; sys.argv[1:] = {OPTIONAL}\n{code}", tmp_path, str(ROOT))
+
+
+def test_the_error_about_a_missing_module_names_its_extra() -> None:
+    error = ModuleNotFoundError("No module named 'viser'", name="viser.theme")
+    assert describe_error(error).endswith("pip install 'flexsheet[console]'")

@@ -125,13 +125,8 @@ def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
 
 
 def _load_joints(path: Path) -> list[Any]:
-    try:
-        import yourdfpy  # type: ignore[import-untyped,import-not-found,unused-ignore]
-    except ImportError as error:
-        raise UrdfError(
-            "reading a URDF file needs the package yourdfpy; install it by "
-            '`pip install "flexsheet[urdf]"`'
-        ) from error
+    import yourdfpy  # type: ignore[import-untyped,import-not-found,unused-ignore]
+
     try:
         if path.stat().st_size > MAX_BYTES:
             raise UrdfError(f"the file is larger than {MAX_BYTES >> 20} MiB")

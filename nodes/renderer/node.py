@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.methods import resolve_method
@@ -23,11 +23,14 @@ from flexsheet.nodes import NodeRole, OmissionReason
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
-from flexsheet.nodes.renderer.frame_renderer import FrameRenderer, RendererInputs
 from flexsheet.nodes.renderer.max_age import MaxAge
-from flexsheet.nodes.renderer.output_window import OutputWindow, open_output
 from flexsheet.nodes.renderer.parameters import RendererParameters
-from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+
+if TYPE_CHECKING:
+    # They import moderngl and glfw, which are installed on the projector's computer only. The other
+    # computers import this module to check the launch file.
+    from flexsheet.nodes.renderer.frame_renderer import FrameRenderer
+    from flexsheet.nodes.renderer.output_window import OutputWindow
 
 READ_TIME_NS = 2_000_000
 """The minimum time (ns) between the end of one frame and the start of the next frame."""
@@ -80,6 +83,9 @@ class Renderer(Node):
         self._output.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
+        from flexsheet.nodes.renderer.frame_renderer import FrameRenderer, RendererInputs
+        from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+
         self._frame_renderer = None
         if scene.projector is None:
             self.set_note(NoteCode.NO_PROJECTOR)
@@ -139,6 +145,8 @@ class Renderer(Node):
             self._draw_if_due()
 
     def _new_output(self) -> OutputWindow:
+        from flexsheet.nodes.renderer.output_window import open_output
+
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
