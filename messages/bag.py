@@ -735,8 +735,17 @@ def recover(
                 writer.add_attachment(
                     whole.create_time, whole.log_time, whole.name, whole.media_type, whole.data
                 )
-            schemas: dict[int, int] = {}
-            channels: dict[int, int] = {}
+            schemas = {
+                one.id: writer.register_schema(one.name, one.encoding, one.data)
+                for one in reader.schemas.values()
+            }
+            channels = {
+                one.id: writer.register_channel(
+                    one.topic, one.message_encoding, schemas[one.schema_id], one.metadata
+                )
+                for one in reader.channels.values()
+                if one.schema_id in schemas
+            }
             for number, chunk in enumerate(reader.chunks):
                 progress(number, len(reader.chunks))
                 try:
@@ -747,24 +756,11 @@ def recover(
                 for record in records:
                     if not isinstance(record, mcap_records.Message):
                         continue
-                    channel = reader.channels.get(record.channel_id)
-                    schema = reader.schemas.get(channel.schema_id) if channel else None
-                    if channel is None or schema is None:
+                    if record.channel_id not in channels:
                         orphans += 1
                         continue
-                    if schema.id not in schemas:
-                        schemas[schema.id] = writer.register_schema(
-                            schema.name, schema.encoding, schema.data
-                        )
-                    if channel.id not in channels:
-                        channels[channel.id] = writer.register_channel(
-                            channel.topic,
-                            channel.message_encoding,
-                            schemas[schema.id],
-                            channel.metadata,
-                        )
                     writer.add_message(
-                        channels[channel.id],
+                        channels[record.channel_id],
                         log_time=record.log_time,
                         data=record.data,
                         publish_time=record.publish_time,

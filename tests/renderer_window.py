@@ -19,6 +19,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.types import Display, Frame, StereoMode
 from flexsheet.nodes.renderer.monitors import WindowError, find_monitor, start_glfw
 from flexsheet.nodes.renderer.output_window import CLOSED, ProjectorWindow
+from tests.note_text import note_text
 from tests.test_renderer import Bench
 from tests.waiting import DEADLINE_S, until
 
@@ -168,7 +169,7 @@ async def test_a_closed_window_leaves_the_renderer_drawing_unseen(bench: WindowB
     frame = await bench.draw("mono")
     assert frame.swapped_ns == 0
     assert frame.light_ns == frame.drawn_ns + 8_000_000
-    assert CLOSED in bench.node.note
+    assert CLOSED in note_text(bench.node)
 
 
 async def test_a_lost_context_is_created_again(bench: WindowBench, display: VirtualDisplay) -> None:
@@ -197,7 +198,7 @@ async def test_a_window_of_another_size_shows_the_middle_unscaled(
         left, top = glfw.get_window_pos(screen._window)
         here = slice(top, top + 200), slice(left, left + 300)
         await until(lambda: screen.poll() and np.array_equal(display.pixels()[here], wanted))
-        assert "unscaled" in bench.node.note
+        assert "unscaled" in note_text(bench.node)
     finally:
         await bench.node.close()
 

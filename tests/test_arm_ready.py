@@ -21,6 +21,7 @@ from flexsheet.nodes.arm_bridge.link import ArmFault, ArmSilentError, ArmStatus,
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from tests.arm_states import arm_state
 from tests.examples import examples, long_except
+from tests.note_text import note_text
 from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
 from tests.test_arm_loop import SCENE_FILE
 
@@ -300,7 +301,7 @@ async def test_failed_exchanges_are_counted_from_the_first_answer_on() -> None:
         while len(link.modes) == asked:
             clock.move_to(clock.now_ns() + round(1e9 / 140))
             await node.cycle()
-        return node.note
+        return note_text(node)
 
     stamp = clock.now_ns()
     await node.step("scene", load_scene(SCENE_FILE), Header(1, stamp, stamp, "here", "tools", 1))

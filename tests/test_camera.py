@@ -31,6 +31,7 @@ from flexsheet.nodes.camera.devices import ReaderThread, open_reader
 from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, split_side_by_side
 from flexsheet.nodes.camera.node import CameraParameters
 from flexsheet.nodes.camera.sources import ImagesSource, OpenCvSource, VideoSource
+from tests.note_text import note_text
 from tests.waiting import DEADLINE_S
 
 
@@ -134,7 +135,7 @@ async def test_a_camera_that_is_not_there_is_tried_again(scene: Scene, tmp_path:
     source = {"kind": "live", "left": str(path)}
     async with running(scene, source=source, retry_s=0.01) as bench:
         await bench.until(lambda: bench.node.errors >= 2)
-        assert f"{str(path)!r} cannot be opened" in bench.node.note
+        assert f"{str(path)!r} cannot be opened" in note_text(bench.node)
         assert bench.sent == []
         frames = [np.hstack([picture(n, 0), picture(n, 1)]) for n in range(FRAMES)]
         write_video(tmp_path / "ready.avi", frames).rename(path)

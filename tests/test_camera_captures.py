@@ -22,6 +22,7 @@ from flexsheet.nodes.camera.captures import RealSenseCapture, list_devices
 from flexsheet.nodes.camera.image_pair import DeviceError
 from flexsheet.nodes.camera.live import CameraReader
 from flexsheet.nodes.camera.sources import OpenCvSource
+from tests.note_text import note_text
 
 SCENE = load_scene()
 SERIAL = "923322071108"
@@ -142,7 +143,7 @@ async def test_a_realsense_gives_stamped_pairs_with_its_projector_off(rs: FakeRe
         assert age_s >= 0.012
         assert pair.skew_s == 0.0
         assert pair.exposure_s == pytest.approx(SCENE.camera.exposure_s)
-        note = bench.node.note
+        note = note_text(bench.node)
         assert f"{SERIAL}: {2 * WIDTH}x{HEIGHT} px GREY at 60 Hz, exposure 4 ms" in note
         assert "stamped by the driver" in note
     assert rs.options["emitter_enabled"] == 0.0
@@ -227,8 +228,8 @@ async def test_the_simulated_camera_of_aravis_is_read() -> None:
         pair, header = bench.sent[-1]
         assert pair.left.shape == pair.right.shape == (HEIGHT, WIDTH)
         assert pair.exposure_s == pytest.approx(SCENE.camera.exposure_s, rel=0.05)
-        assert f"Fake_1: {2 * WIDTH}x{HEIGHT} px GREY at 25 Hz" in bench.node.note
-        assert "stamped by the driver" in bench.node.note
+        assert f"Fake_1: {2 * WIDTH}x{HEIGHT} px GREY at 25 Hz" in note_text(bench.node)
+        assert "stamped by the driver" in note_text(bench.node)
         steps = np.diff([one.source_ns for _, one in bench.sent])
         assert (steps > 0).all()
         assert header.source_ns <= time.monotonic_ns()
@@ -245,8 +246,8 @@ async def test_a_gstreamer_pipeline_is_read() -> None:
         await bench.until(lambda: len(bench.sent) >= 5)
         pair, _ = bench.sent[-1]
         assert pair.left.shape == pair.right.shape == (HEIGHT, WIDTH)
-        assert f"{2 * WIDTH}x{HEIGHT} px at 30 Hz" in bench.node.note
-        assert "stamped by the driver" in bench.node.note
+        assert f"{2 * WIDTH}x{HEIGHT} px at 30 Hz" in note_text(bench.node)
+        assert "stamped by the driver" in note_text(bench.node)
 
 
 def test_a_pipeline_that_gstreamer_rejects_is_an_error() -> None:

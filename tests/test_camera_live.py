@@ -31,6 +31,7 @@ from flexsheet.nodes.camera.live import CameraReader
 from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import MAX_IMPLAUSIBLE, SLACK, Pairing, StampCheck
 from tests.examples import examples
+from tests.note_text import note_text
 from tests.waiting import DEADLINE_S
 
 MS = 1_000_000
@@ -209,7 +210,7 @@ async def test_the_skew_is_published_and_too_much_is_rejected(
         left.shoot(PERIOD_NS)
         right.shoot(PERIOD_NS - 6 * MS)
         await bench.until(lambda: bench.node.rejected == 1)
-        assert "pairs-rejected: 1, -6.0 ms between left and right exposure" in bench.node.note
+        assert "pairs-rejected: 1, -6.0 ms between left and right exposure" in note_text(bench.node)
         left.shoot(2 * PERIOD_NS)
         right.shoot(2 * PERIOD_NS + MS)
         await bench.until(lambda: len(bench.sent) == 2)
@@ -237,7 +238,7 @@ async def test_frames_that_a_camera_lost_show_in_its_stamps(
         right.shoot(7 * PERIOD_NS)
         await bench.until(lambda: len(bench.sent) == 5)
         assert bench.sent[-1][0].dropped_frames == 3
-        assert "1 frames without a partner" in bench.node.note
+        assert "1 frames without a partner" in note_text(bench.node)
         bag.empty()
 
 
@@ -296,7 +297,7 @@ async def test_a_rejected_setting_is_reported_once(
             "camera 0: auto white balance: requested 0 (off), actual: 1",
             "camera 2: rate: requested 60 Hz, actual: 30 Hz",
         ):
-            assert text in bench.node.note
+            assert text in note_text(bench.node)
         for fake in cameras:
             fake.shots.put(None)
         await bench.until(lambda: bench.node.errors == 4 and len(right.captures) == 2)
@@ -365,7 +366,7 @@ async def test_the_regions_come_out_with_their_origins(bag: CameraBag, scene: Sc
         assert (pair.left_origin_px, pair.right_origin_px) == ((32, 20), (16, 30))
         np.testing.assert_array_equal(pair.left, ramp[20:60, 32:96])
         np.testing.assert_array_equal(pair.right, ramp[30:80, 16:96])
-        assert "regions cropped from the device's region" in bench.node.note
+        assert "regions cropped from the device's region" in note_text(bench.node)
         bag.empty()
 
 
@@ -380,8 +381,8 @@ async def test_a_camera_is_unplugged_and_comes_back(
         await bench.until(lambda: len(bench.sent) == 1)
         right.unplug()
         left.shots.put(None)
-        await bench.until(lambda: "cannot be opened" in bench.node.note)
-        assert bench.node.note.startswith("no-images: 2 cannot be opened")
+        await bench.until(lambda: "cannot be opened" in note_text(bench.node))
+        assert note_text(bench.node).startswith("no-images: 2 cannot be opened")
         assert all(capture.released.is_set() for capture in right.captures)
         tried = len(left.captures)
         await bench.until(lambda: len(left.captures) > tried)

@@ -25,6 +25,7 @@ from flexsheet.nodes.clock.node import ClockNode, ClockParameters
 from flexsheet.nodes.clock.offset import OtherClock, Sample, compute_bounds, make_sample
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output
 from tests.examples import examples
+from tests.note_text import note_text
 from tests.test_launch_supervisor import LISTENER, beacon, write
 from tests.test_messages_wire import HEADER as SOME_HEADER
 from tests.test_security import target
@@ -262,7 +263,7 @@ async def test_two_clock_nodes_measure_one_another() -> None:
         assert found.clock_id == ("far" if name == "near" else "near")
         assert abs(found.offset_ns - sign * pair.far_ns) <= found.uncertainty_s * 1e9 < 2 * MS
         assert abs(found.drift_ratio) < 1e-6
-    assert "+25200" in pair.nodes["near"].note
+    assert "+25200" in note_text(pair.nodes["near"])
 
 
 async def test_a_clock_that_falls_silent_is_known_less_and_less_and_then_not_at_all() -> None:

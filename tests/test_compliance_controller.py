@@ -22,6 +22,7 @@ from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 from flexsheet.nodes.planner.trajectory import offset_along_normal
 from tests.examples import long_except
+from tests.note_text import note_text
 from tests.test_planner import FRAME_NS, SCENE, Table, in_world, on_cylinder, table
 from tests.twists import twist_between
 
@@ -80,7 +81,7 @@ async def test_a_finger_meets_the_objects_force_by_the_twins_sheet(
         float(object_force_n(np.array(depth_m), scale)), rel=TARGET_ERROR_RATIO
     )
     assert pull_n < SCENE.sheet.max_edge_force_n
-    assert desk.planner.note == "sheet force model: table"
+    assert note_text(desk.planner) == "sheet force model: table"
 
 
 async def test_what_is_published_as_retreat_is_where_the_sheet_comes_to_rest() -> None:
@@ -188,7 +189,7 @@ async def test_a_soft_body_without_a_curve_changes_nothing() -> None:
 async def test_what_the_sheet_cannot_render_is_reported(scale: float, words: str) -> None:
     desk = await table()
     await desk.planner.step("soft_body", soft_body(scale), desk.header())
-    assert f"object is {words} the" in desk.planner.note
+    assert f"object is {words} the" in note_text(desk.planner)
 
 
 async def test_a_calibrated_sheet_is_planned_with() -> None:

@@ -6,11 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.messages.arms_calibration import ArmsCalibration
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.calibration_file import CalibrationFileError
-from flexsheet.messages.marker_calibration import MarkerCalibration
-from flexsheet.messages.sheet_calibration import SheetCalibration
 
 ROOT = Path(__file__).resolve().parent.parent
 WHOLE = next((ROOT / "launch" / "calibrations").glob("*.yaml")).read_text()
@@ -30,20 +27,11 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", list(HOSTILE))
-@pytest.mark.parametrize(
-    "load",
-    [
-        StereoCalibration.load,
-        ArmsCalibration.load,
-        SheetCalibration.load,
-        MarkerCalibration.load,
-    ],
-)
-def test_it_is_rejected(tmp_path: Path, load: object, name: str) -> None:
+def test_it_is_rejected(tmp_path: Path, name: str) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_bytes(HOSTILE[name])
     with pytest.raises(CalibrationFileError) as refused:
-        load(file)  # type: ignore[operator]  # a list of functions
+        StereoCalibration.load(file)
     assert str(file) in str(refused.value)
     assert len(str(refused.value)) < 2000
 

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.topics import Topic, UnknownTopicError
 from flexsheet.messages.types import EStop, FingerPath, Fingertip, SheetTarget
 from flexsheet.nodes import NODES, NodeImportError, UnknownNodeError, node_class
@@ -65,7 +66,7 @@ class Echo(Node):
 
     @periodic("rate_hz")
     def tick(self) -> None:
-        self.note = "ticked"
+        self.set_note(NoteCode.INFO, "ticked")
 
 
 def fingertip() -> Fingertip:

@@ -27,6 +27,7 @@ from flexsheet.nodes.arm_bridge.path_check import (
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from tests.examples import examples
+from tests.note_text import note_text
 from tests.test_arm_control import (
     HOME,
     SCENE,
@@ -336,10 +337,10 @@ async def test_the_simulated_arms_rest_at_a_blocked_path_and_follow_a_clear_one(
         servos = [nodes["twin"].servers[side].controller.servo for side in sides]
         places = [servo.joints_rad.copy() for servo in servos]
         task = asyncio.create_task(aim(rig, nodes, FAR))
-        await until(lambda: all("no path" in nodes[side].note for side in sides))
+        await until(lambda: all("no path" in note_text(nodes[side]) for side in sides))
         assert {rig.newest(side).mode for side in sides} == {"hold"}
-        assert nodes["left"].note.split(";")[0] == nodes["right"].note.split(";")[0]
-        assert "left arm, at " in nodes["left"].note
+        assert note_text(nodes["left"]).split(";")[0] == note_text(nodes["right"]).split(";")[0]
+        assert "left arm, at " in note_text(nodes["left"])
         for servo, place in zip(servos, places, strict=True):
             assert (servo.joints_rad == place).all()
         task.cancel()

@@ -36,6 +36,7 @@ from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from tests.examples import examples
 from tests.fingertips import fingertip
+from tests.note_text import note_text
 from tests.scenes import load_cylinder, load_values, make_weightless, set_density
 from tests.twists import twist_between
 
@@ -492,14 +493,14 @@ async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> 
     sheet = SCENE.sheet
     force = edge_force_n(target.stretch_ratio, sheet)
     assert push_stiffness_n_per_m(force, width_m=sheet.width_m) == pytest.approx(45.0, rel=1e-6)
-    assert desk.planner.note == "sheet force model: table"
+    assert note_text(desk.planner) == "sheet force model: table"
 
 
 @pytest.mark.parametrize(("stiffness", "words"), [(2.0, "softer"), (5000.0, "stiffer")])
 async def test_what_the_sheet_cannot_render_is_reported(stiffness: float, words: str) -> None:
     desk = await table(compliance_mode="stiffness")
     await desk.planner.step("soft_body", soft(stiffness), desk.header())
-    assert words in desk.planner.note
+    assert words in note_text(desk.planner)
     least, largest = compute_stretch_range(SCENE.sheet)
     target = await desk.rest_at(in_world(on_cylinder(0.0, -0.001)), 300)
     assert target.stretch_ratio == pytest.approx(least if words == "softer" else largest)

@@ -34,6 +34,7 @@ from flexsheet.nodes.recorder.bag_recording import RETRY_NS, free_path
 from flexsheet.nodes.recorder.node import Recorder
 from flexsheet.nodes.recorder.parameters import RecorderParameters
 from tests.node_harness import NodeHarness
+from tests.note_text import note_text
 from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -173,7 +174,7 @@ async def test_a_failing_disk_is_reported_and_losses_are_counted(
     assert node.inputs["in/estop"].counts.dropped == 3
     assert node.errors == 1
     assert [one.code for one in node.notes] == [NoteCode.NOT_RECORDING]
-    assert "Input/output error" in node.note
+    assert "Input/output error" in note_text(node)
     # It is asked again after a while, in vain, and then it has come back.
     clock.move_to(clock.now_ns() + RETRY_NS)
     node.watch_disk()

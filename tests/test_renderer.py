@@ -45,6 +45,7 @@ from tests.arm_states import arm_state
 from tests.correction_reference import correct
 from tests.fingertips import fingertip
 from tests.node_harness import NodeHarness
+from tests.note_text import note_text
 from tests.packing import pack
 from tests.scenes import load_cylinder
 
@@ -506,7 +507,7 @@ async def test_stale_arms_keep_the_last_plane_and_are_reported(bench: Bench) -> 
     bench.forward(500)
     await bench.finger(0.0, 0.0, 0.1)
     assert np.allclose(bench.sent[-1][0].world_from_sheet, pose, atol=1e-9)
-    assert "sheet-pose-old: the arm poses are 0.50 s old" in bench.node.note
+    assert "sheet-pose-old: the arm poses are 0.50 s old" in note_text(bench.node)
 
 
 async def test_with_a_slow_camera_older_poses_are_used(bench: Bench) -> None:
@@ -529,7 +530,7 @@ async def test_sheet_turned_away_holds_the_last_plane(bench: Bench) -> None:
     await bench.arms(transform(rotation_from_vector([1.5, 0.0, 0.0]), [0.0, 0.0, 0.0]))
     await bench.finger(0.0, 0.0, 0.1)
     assert np.allclose(bench.sent[-1][0].world_from_sheet, np.eye(4), atol=1e-9)
-    assert "edge-on" in bench.node.note
+    assert "edge-on" in note_text(bench.node)
 
 
 async def test_sheet_is_predicted_to_when_the_light_leaves(bench: Bench) -> None:

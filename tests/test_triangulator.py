@@ -24,6 +24,7 @@ from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameter
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from tests.node_harness import NodeHarness
+from tests.note_text import note_text
 from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
@@ -198,7 +199,7 @@ async def test_late_images_are_counted_and_a_new_camera_is_not_late(
         await bench.show(*here)
     await bench.show(*here, frames=-2)
     assert (len(bench.sent), bench.node.late) == (4, 1)
-    assert "image pairs dropped as late: 1;" in bench.node.note
+    assert "image pairs dropped as late: 1;" in note_text(bench.node)
     await bench.show(*here, frames=3)
     assert (len(bench.sent), bench.node.late) == (5, 1)
     await bench.show(*here, frames=-3, epoch=2)

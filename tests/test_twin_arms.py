@@ -33,6 +33,7 @@ from flexsheet.nodes.twin.arms import (
 )
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from flexsheet.nodes.twin.mxt_controller import MxtServer
+from tests.note_text import note_text
 from tests.rv_1a import (
     ACCELERATION_RAD_PER_S2,
     RANGE_RAD,
@@ -375,6 +376,6 @@ async def test_the_node_can_use_the_real_time_control() -> None:
         assert node.errors == 0, node.last_error
         assert {type(server) for server in node.servers.values()} == {MxtServer}
         await node.cycle()
-        assert node.note == "left: 0 commands, refused: 0, right: 0 commands, refused: 0"
+        assert note_text(node) == "left: 0 commands, refused: 0, right: 0 commands, refused: 0"
     finally:
         await node.close()

@@ -26,6 +26,7 @@ from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameter
 from flexsheet.nodes.twin.paths import recorded_path
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
+from tests.note_text import note_text
 from tests.scenes import load_cylinder
 from tests.waiting import until
 
@@ -395,8 +396,8 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
     )
     await node.step("twin__finger_path", fast, header())
     assert node.errors == 0
-    assert node.note.startswith('finger-path-refused: "fast": path: the speed')
-    assert node.note.endswith("increase the times")
+    assert note_text(node).startswith('finger-path-refused: "fast": path: the speed')
+    assert note_text(node).endswith("increase the times")
     assert [one.code for one in node.notes] == [NoteCode.FINGER_PATH_REFUSED]
     assert np.array_equal(node.truth(10**9).position, before)
     far = fast.model_copy(
@@ -406,10 +407,10 @@ async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:
         }
     )
     await node.step("twin__finger_path", far, header())
-    assert node.note.endswith("give positions in metres (20 mm are 0.02)")
+    assert note_text(node).endswith("give positions in metres (20 mm are 0.02)")
     slow = fast.model_copy(update={"label": "slow", "times_s": np.array([0.0, 1.0])})
     await node.step("twin__finger_path", slow, header())
-    assert node.note == 'follows the path "slow"'
+    assert note_text(node) == 'follows the path "slow"'
 
 
 async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(
@@ -428,16 +429,16 @@ async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(
         await node.step("scene", scene, header())
         await sent.until("twin/stereo", 5)
         assert not node.missed_frames
-        assert not node.note
+        assert not note_text(node)
         clock.move_to(clock.now_ns() + 200_000_000)
         frames = await sent.until("twin/stereo", 12)
         # The number increases before the note that states it.
         busy = "because the computer was busy"
-        await until(lambda: node.note == f"frames-missed: {node.missed_frames} {busy}")
+        await until(lambda: note_text(node) == f"frames-missed: {node.missed_frames} {busy}")
         node.path_label = "stroke"
         await until(
             lambda: (
-                node.note
+                note_text(node)
                 == f'follows the path "stroke"; frames-missed: {node.missed_frames} {busy}'
             )
         )
