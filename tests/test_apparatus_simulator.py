@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flexsheet.launch.bags.report.series import Grid
-from flexsheet.launch.bags.report.strokes import SheetErrors
 from flexsheet.launch.experiments.compliance import ForceReference, make_presses
+from flexsheet.launch.experiments.followed import FollowedSheet
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus, FingerTruth, nominal_apparatus
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
-from flexsheet.messages.types import FingerPath, Fingertip, StereoPair, TwinArms, TwinFinger
+from flexsheet.messages.types import FingerPath, Fingertip, Side, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes.models.measured_period import MIN_INTERVALS, MeasuredPeriod
-from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.twin.arms import (
@@ -387,15 +386,22 @@ def test_the_head_sways_as_much_as_stated() -> None:
 
 
 def test_reports_take_the_true_edges() -> None:
-    errors = SheetErrors(Grid(0, 1.0, 1))
     given = apparatus(arms={"left": {"edge_position_offset_m": [0, 0, 1e-3]}})
+    still = np.eye(4)
+    arms = TwinArms(joints_left_rad=np.zeros(6), joints_right_rad=np.zeros(6),
+                    world_from_flange_left=still, world_from_flange_right=still)  # fmt: skip
     for order in ((SCENE, given), (given, SCENE)):
-        errors = SheetErrors(Grid(0, 1.0, 1))
-        for message in order:
-            errors.add(message, START_NS)
-        off = errors._true_edge_poses["left"] - errors._edge_poses["left"]
-        assert off[:3, 3] == pytest.approx([0, 0, 1e-3])
-        assert np.array_equal(errors._true_edge_poses["right"], errors._edge_poses["right"])
+        sheet = FollowedSheet()
+        for number, message in enumerate((*order, arms, arms)):
+            sheet.add(message, START_NS + number)
+        for arm, off_m in ((SCENE.arms.left, 1e-3), (SCENE.arms.right, 0.0)):
+            side: Side = "left" if arm is SCENE.arms.left else "right"
+            edge = sheet._make_edge(SCENE, "true", side)
+            assert edge is not None
+            believed = pose_matrix(arm.flange_from_edge)
+            expected = believed[:3, 3] + [0.0, 0.0, off_m]
+            assert edge.values[0, :3] == pytest.approx(expected)
+            assert edge.values[0, 3:] == pytest.approx(believed[:3, 1:3].T.ravel())
 
 
 def test_the_presented_force_is_that_of_the_true_sheet() -> None:

@@ -373,15 +373,15 @@ def report(
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Write an HTML report on a recording, with faults, charts, tables and images.
+    """Write an HTML report on a recording: problems, a chart over time, and numbers.
 
-    The page needs no network connection. With --json, the command prints the values, and writes a
-    page only if --output is given. If the bag is truncated, the report covers its readable part.
+    A JSON file with the numbers, with the suffix .report.json, is written beside the page. With
+    --json, the numbers are printed, and files are written only if --output is given. If the bag is
+    truncated, the report covers its readable part.
     """
-    from flexsheet.launch.bags.report.write import default_output
-    from flexsheet.launch.bags.report.write import report as report_on
+    from flexsheet.launch.bags.report import report as report_on
 
-    page = output if as_json else output or default_output(bag)
+    page = output if as_json else output or bag.with_suffix(".html")
     with progress_bar(f"reading {bag.name}") as progress:
         result = report_on(bag, page, progress)
     if as_json:

@@ -557,7 +557,7 @@ class Laboratory:
         The errors are measured during a stroke of the finger. In a simulated laboratory, they are
         also measured with a resting finger.
         """
-        from flexsheet.launch.bags.report.findings import BRIEFLY_BUSY_FRACTION
+        from flexsheet.launch.bags.report import BRIEFLY_BUSY_FRACTION
         from flexsheet.launch.calibration.prediction import predict_errors
 
         scene = load_scene(lab.scene_copy)

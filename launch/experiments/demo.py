@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flexsheet.launch.bags.report.strokes import read_followed
 from flexsheet.launch.experiments import find_recorded, image, stroke
+from flexsheet.launch.experiments.followed import read_followed
 from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from flexsheet.launch.experiments.run import (
     Procedure,

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flexsheet.launch.bags.report.followed import FollowedFinger
+from flexsheet.launch.experiments.followed import summarize_path
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
@@ -454,7 +454,7 @@ def follow_in_simulated_time(
 ) -> dict[str, Any]:
     """Simulate the sheet's motion along a finger path, and return the errors of the sheet.
 
-    The result has the keys of `FollowedFinger.figures`. The key `servo_lag_ms` contains the servo
+    The result has the keys of `summarize_path`. The key `servo_lag_ms` contains the servo
     lags that the control nodes of both arms have measured at the end. The key
     `servo_lag_uncertainty_ms` contains their standard deviations.
     """
@@ -486,11 +486,9 @@ def follow_in_simulated_time(
         surface=SheetSurface.of(scene, truth),
     )
     heights_m = shape.closest(apply(inverse(object_pose(scene)), points)).height_m
-    found = FollowedFinger()
-    found.add(*errors, heights_m, np.array(following))
     deviations_s = [arm.lag_uncertainty_s for arm in loop.sheet.arms]
     return {
-        **found.figures(),
+        **summarize_path(*errors, heights_m, np.array(following)),
         "servo_lag_ms": [1e3 * arm.lag_s for arm in loop.sheet.arms],
         "servo_lag_uncertainty_ms": [None if one is None else 1e3 * one for one in deviations_s],
     }

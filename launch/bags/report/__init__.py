@@ -1,1 +1,0 @@
-"""Write an HTML report of a recorded session (`flexsheet bag report`)."""
