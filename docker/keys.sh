@@ -9,9 +9,7 @@ shift
 here=$(dirname "$0")
 for host in "$@"; do
     mkdir -p -m 700 "$here/keys/$host"
-    if [ ! -e "$here/keys/$host/$host.secret" ]; then
-        FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys new "$host"
-    fi
+    FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys new "$host"
     FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys install "$launch_file" "$host"
 done
 # The user in the containers is 1000.

@@ -188,7 +188,9 @@ def test_topic_list_without_a_graph_contains_all_topics(
 
 
 def test_node_types_and_info(flexsheet: Command) -> None:
-    assert [row["type"] for row in flexsheet("node", "types", "--json").json()] == list(NODES)
+    assert [row["type"] for row in flexsheet("node", "list", "--all", "--json").json()] == list(
+        NODES
+    )
     described = flexsheet("node", "info", "planner", "--json").json()
     assert {"port": "sheet_target", "direction": "output", "message": "SheetTarget"} in described[
         "ports"
@@ -350,11 +352,14 @@ def test_a_tool_cannot_publish_for_a_node(flexsheet: Command, running: Path) -> 
     assert "is written by beacon" in printed.err
 
 
-def test_hz_goes_by_the_writers_stamps(flexsheet: Command, running: Path) -> None:
+def test_rate_bandwidth_and_age_are_measured_per_writer(flexsheet: Command, running: Path) -> None:
     (row,) = flexsheet("topic", "hz", "twin/finger", "--duration", "1", "--json").json()
     assert row["writer"] == "beacon"
     assert row["lost"] == 0
     assert 5 < row["rate_hz"] < 60
+    assert 0 < row["mean_bytes"] < 5000
+    assert row["bytes_per_s"] > 0
+    assert 0 < row["age_ms"]["p50"] <= row["age_ms"]["max"]
     assert "beacon" in flexsheet("topic", "hz", "status", "--duration", "2.5").out
 
 
@@ -377,15 +382,6 @@ def test_info_gives_type_default_and_description(flexsheet: Command) -> None:
         "None",
         "0.0",
     )
-
-
-def test_bandwidth_and_delay_are_measured_per_writer(flexsheet: Command, running: Path) -> None:
-    (row,) = flexsheet("topic", "bw", "twin/finger", "--duration", "1", "--json").json()
-    assert row["writer"] == "beacon"
-    assert row["min_bytes"] <= row["mean_bytes"] <= row["max_bytes"] < 5000
-    assert row["bytes_per_s"] > 0
-    (row,) = flexsheet("topic", "delay", "twin/finger", "--duration", "1", "--json").json()
-    assert 0 < row["age_ms"]["p50"] <= row["age_ms"]["max"]
 
 
 def test_nodes_of_the_running_graph_are_listed(flexsheet: Command, running: Path) -> None:
@@ -541,12 +537,15 @@ def test_logs_print_the_log_of_a_node(flexsheet: Command, running: Path) -> None
 def test_a_parameter_is_read_and_changed_in_the_running_graph(
     flexsheet: Command, running: Path
 ) -> None:
-    rows = {row["parameter"]: row for row in flexsheet("param", "list", "--json").json()}
+    rows = {row["parameter"]: row for row in flexsheet("param", "get", "--json").json()}
     assert rows["listener.patience_s"]["live"]
     assert not rows["beacon.rate_hz"]["live"]
     assert flexsheet("param", "set", "listener.patience_s", "2.5", "--json").json()["value"] == 2.5
     assert flexsheet("param", "get", "listener.patience_s").out == "2.5\n"
-    lines = flexsheet("param", "list").out.splitlines()
+    (row,) = flexsheet("param", "get", "listener.patience_s", "--json").json()
+    assert (row["value"], row["live"]) == (2.5, True)
+    assert "beacon" not in flexsheet("param", "get", "listener").out
+    lines = flexsheet("param", "get").out.splitlines()
     assert lines[0].split() == ["parameter", "value", "live"]
     recorded = next(line for line in lines if line.startswith("recorder.topics "))
     assert "null" in recorded or "[" in recorded
@@ -559,7 +558,7 @@ def test_parameters_of_a_node_that_cannot_be_imported_here_are_listed(
         raise NodeImportError("no module; write PYTHONPATH=FOLDER before the command")
 
     monkeypatch.setattr("flexsheet.nodes.node_class", refuse)
-    rows = {row["parameter"]: row for row in flexsheet("param", "list", "--json").json()}
+    rows = {row["parameter"]: row for row in flexsheet("param", "get", "--json").json()}
     assert rows["beacon.rate_hz"]["live"] is None
     assert flexsheet("param", "get", "beacon.rate_hz").code == 0
     printed = flexsheet("param", "set", "beacon.rate_hz", "3")

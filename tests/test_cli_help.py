@@ -62,6 +62,10 @@ def test_the_command_line_is_this() -> None:
     }  # fmt: skip
 
 
+def test_the_number_of_commands_does_not_grow() -> None:
+    assert len(COMMANDS) <= 63, sorted(COMMANDS)
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_explains_itself_with_examples_that_parse(name: str) -> None:
     command = COMMANDS[name]

@@ -1,4 +1,4 @@
-"""`flexsheet apparatus`: sample and show the true parameters of simulated hardware.
+"""`flexsheet apparatus`: show and write the true parameters of simulated hardware.
 
 A set of these parameters is called an apparatus.
 """
@@ -11,62 +11,16 @@ from typing import Annotated, Any
 import typer
 
 from flexsheet.launch.commands import options
-from flexsheet.launch.commands.output import (
-    examples,
-    print_json,
-    print_outcome,
-    print_rows,
-    words,
-)
+from flexsheet.launch.commands.output import examples, print_json, print_rows, words
 
-app = options.make_app("Sample and show an apparatus: true parameters of the simulated hardware.")
+app = options.make_app()
 
 
 @app.command(
     epilog=examples(
-        "flexsheet apparatus sample --seed 7 -o apparatus.yaml",
-        "flexsheet apparatus sample --seed 7 --profile paper --calibrated -o apparatus.yaml",
-    )
-)
-def sample(
-    *,
-    seed: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            help="Random seed; seeds 0 to 99 are for development, higher seeds for evaluation.",
-        ),
-    ],
-    output: Annotated[Path, options.output_file("Apparatus file to write.")],
-    profile: options.ProfileOption = "modern",
-    calibrated: options.CalibratedOption = False,
-    scene: options.SceneOption = options.CYLINDER,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Write a random apparatus, which is a set of true parameters of simulated hardware.
-
-    The parameters are sampled within the tolerances of the hardware.
-    """
-    from flexsheet.launch.plans.apparatus import format_apparatus
-    from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.messages.files import write_file
-    from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
-
-    drawn = sample_apparatus(
-        load_scene(scene), seed, profile=Profile(profile), calibrated=calibrated
-    )
-    write_file(output, format_apparatus(drawn))
-    print_outcome(
-        {"file": str(output), "origin": drawn.origin, "scene": drawn.scene},
-        f"{drawn.origin}: written to {output}",
-        as_json=as_json,
-    )
-
-
-@app.command(
-    epilog=examples(
-        "flexsheet apparatus show apparatus.yaml",
-        "flexsheet apparatus show seed:7,paper --json",
+        "flexsheet apparatus apparatus.yaml",
+        "flexsheet apparatus seed:7,paper --json",
+        "flexsheet apparatus seed:7,paper,calibrated -o apparatus.yaml",
     )
 )
 def show(
@@ -74,22 +28,33 @@ def show(
     apparatus: Annotated[
         str,
         typer.Argument(
-            metavar="FILE|seed:N", help="Apparatus file, or seed:N for a random sample."
+            metavar="FILE|seed:N",
+            help="Apparatus file, or seed:N for a random sample. Seeds 0 to 99 are for "
+            "development, higher seeds for evaluation. seed:7,paper simulates older equipment. "
+            "seed:7,calibrated contains only the errors that remain after calibrations.",
         ),
     ],
+    output: Annotated[
+        Path | None, options.output_file("File to which the apparatus is written.")
+    ] = None,
     scene: options.SceneOption = options.CYLINDER,
     as_json: options.JsonOption = False,
 ) -> None:
     """Check an apparatus, and list its parameters that differ from the scene.
 
-    An apparatus is a set of true parameters of simulated hardware. The exit code is 2 if the file
-    has unknown keys or impossible values, or belongs to another scene.
+    An apparatus is a set of true parameters of simulated hardware. A sample lies within the
+    tolerances of the hardware. The exit code is 2 if a file has unknown keys or impossible values,
+    or belongs to another scene.
     """
-    from flexsheet.launch.plans.apparatus import load_apparatus
+    from flexsheet.launch.plans.apparatus import format_apparatus, load_apparatus
     from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.files import write_file
     from flexsheet.nodes.twin.tolerance_table import NOT_SIMULATED, list_differences
 
     loaded = load_apparatus(apparatus, load_scene(scene), scene)
+    if output is not None:
+        write_file(output, format_apparatus(loaded))
+        words.print(f"{loaded.origin}: written to {output}")
     rows: list[dict[str, Any]] = [
         {
             "parameter": path,

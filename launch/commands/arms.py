@@ -1,4 +1,4 @@
-"""`flexsheet arms`: show, enable, disable, stop and reset the arms of a running graph."""
+"""`flexsheet arms`: enable, disable, stop and reset the arms of a running graph."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from flexsheet.launch.commands.graph import (
 from flexsheet.launch.commands.options import (
     ChangedRunOption,
     JsonOption,
-    RunOption,
     StoppedRunOption,
     make_app,
 )
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from flexsheet.messages.bus import Subscriber
     from flexsheet.messages.types import ArmState, EStop
 
-app = make_app("Show, enable, disable, stop and reset the arms of a running graph.")
+app = make_app("Enable, disable, stop and reset the arms of a running graph.")
 
 SIDES = ("left", "right")
 TOPICS = ("arm_left", "arm_right", "status")
@@ -53,15 +52,6 @@ MAX_STATE_AGE_S, POLL_PERIOD_S = 0.5, 0.02
 ReasonOption = Annotated[
     str, typer.Option("--reason", help="Reason for the command; it is shown and logged.")
 ]
-
-
-@app.command(epilog=examples("flexsheet arms status", "flexsheet arms status --json"))
-def status(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Print the state of both arms.
-
-    The exit code is 1 if an arm does not report its state.
-    """
-    raise typer.Exit(_command(run, None, lambda arms: len(arms) == 2, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms enable"))
@@ -354,7 +344,7 @@ class _Arms:
 
 def _command(
     run_directory: Path | None,
-    command: tuple[str, Message] | None,
+    command: tuple[str, Message],
     done: Callable[[dict[str, ArmState]], bool],
     as_json: bool,
 ) -> int:
@@ -362,7 +352,7 @@ def _command(
 
     Returns the exit code.
 
-    command: topic and message to publish. If it is None, nothing is published.
+    command: topic and message to publish.
     done: function that receives the arm states, and returns True when the command has had its
         effect.
     """
@@ -370,10 +360,9 @@ def _command(
 
     async def work() -> int:
         async with _Arms(plan, run) as arms:
-            if command is not None:
-                await arms.publish(*command)
+            await arms.publish(*command)
             confirmed = await arms.wait_for(done)
-        print_rows(_rows(arms.states, arms.notes), as_json=as_json)
+        print_rows(describe_arms(arms.states, arms.notes), as_json=as_json)
         for text in arms.problems:
             words.print(text)
         if not confirmed:
@@ -387,7 +376,7 @@ def _command(
     return run_interruptible(work())
 
 
-def _rows(arms: dict[str, ArmState], notes: dict[str, str]) -> list[dict[str, Any]]:
+def describe_arms(arms: dict[str, ArmState], notes: dict[str, str]) -> list[dict[str, Any]]:
     """Return one table row for each arm.
 
     notes: note of each arm's bridge, by side, which is the reason of an arm without a state.
@@ -426,7 +415,9 @@ def _show_stop(results: list[_StopResult], as_json: bool) -> None:
         for result in results
         for one in result.attempts
     ]
-    arms = [{**name_run(result), **row} for result in results for row in _rows(result.arms, {})]
+    arms = [
+        {**name_run(result), **row} for result in results for row in describe_arms(result.arms, {})
+    ]
     if as_json:
         stopped = all(result.confirmed for result in results)
         print_json({"stopped": stopped, "paths": paths, "arms": arms})

@@ -9,12 +9,10 @@ from typer.core import TyperCommand
 
 from flexsheet.launch.commands.options import JsonOption, LaunchArgument, make_app
 from flexsheet.launch.commands.output import (
-    FAILED,
     CommandError,
     examples,
     print_json,
     print_outcome,
-    print_rows,
     words,
 )
 
@@ -50,66 +48,34 @@ def new(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Create the key pair of this computer, and print the public key.
+    """Create the key pair of this computer if there is none, and print the public key.
 
     Run the command on the host itself. The secret key is stored in a file that only you can read.
     """
     import re
 
     from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import make_key_pair, write_secret
+    from flexsheet.messages.security import (
+        derive_public_key,
+        make_key_pair,
+        read_secret,
+        write_secret,
+    )
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
         raise CommandError(f'"{host}": invalid host name; use lower-case letters, digits and _')
-    public, secret = make_key_pair()
     file = secret_file(host)
-    write_secret(file, secret, replace=replace)
+    if file.exists() and not replace:
+        public = derive_public_key(read_secret(file))
+    else:
+        public, secret = make_key_pair()
+        write_secret(file, secret, replace=replace)
     words.print(f"secret key: {file}; do not copy it to another computer")
     words.print(f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'")
     if as_json:
         print_json({"host": host, "public": public, "secret_file": str(file)})
     else:
         print(public)
-
-
-@app.command(epilog=examples("flexsheet keys show", "flexsheet keys show left"))
-def show(
-    host: Annotated[
-        str | None, typer.Argument(help="Name of the host in the launch file; default: all hosts.")
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Print the public keys stored on this computer.
-
-    The exit code is 1 if a key cannot be read.
-    """
-    from flexsheet.launch.running.keys import directory, secret_file
-    from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
-
-    files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
-    if not files:
-        raise CommandError(
-            f"{directory()}: the folder contains no keys; create one: flexsheet keys new HOST",
-            FAILED,
-        )
-    rows = []
-    problems = []
-    for file in files:
-        try:
-            public = derive_public_key(read_secret(file))
-            rows.append({"host": file.stem, "public": public, "secret_file": str(file)})
-        except SecurityError as error:
-            problems.append(str(error))
-    if as_json:
-        print_json({"keys": rows, "problems": problems})
-    elif host and rows:
-        print(rows[0]["public"])
-    else:
-        print_rows(rows, as_json=False)
-    for problem in problems:
-        words.print(problem)
-    if problems:
-        raise typer.Exit(FAILED)
 
 
 @app.command(

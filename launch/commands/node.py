@@ -14,27 +14,38 @@ from flexsheet.launch.commands.output import (
     print_fields,
     print_json,
     print_rows,
+    words,
 )
 
 app = make_app("List nodes and node types, and describe their ports and parameters.")
 
 
-@app.command("list", epilog=examples("flexsheet node list"))
-def list_nodes(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """List the nodes of the running graph."""
-    plan, _ = running_graph(run)
-    rows = [
-        {"node": node.name, "type": node.type, "host": node.host} for node in plan.nodes.values()
-    ]
-    print_rows(rows, as_json=as_json)
+@app.command("list", epilog=examples("flexsheet node list", "flexsheet node list --all"))
+def list_nodes(
+    list_all: Annotated[
+        bool, typer.Option("--all", help="List the node types that launch files can use.")
+    ] = False,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the nodes of the running graph, or the node types that launch files can use.
 
-
-@app.command("types", epilog=examples("flexsheet node types"))
-def list_types(as_json: JsonOption = False) -> None:
-    """List the node types that launch files can use."""
+    If no graph is running, the node types are listed.
+    """
     from flexsheet.nodes import NODES
 
-    print_rows([{"type": name, "class": path} for name, path in NODES.items()], as_json=as_json)
+    rows = [{"type": name, "class": path} for name, path in NODES.items()]
+    if not list_all:
+        try:
+            plan, _ = running_graph(run)
+        except NoGraphError as error:
+            words.print(f"{error}; all node types follow")
+        else:
+            rows = [
+                {"node": node.name, "type": node.type, "host": node.host}
+                for node in plan.nodes.values()
+            ]
+    print_rows(rows, as_json=as_json)
 
 
 @app.command(

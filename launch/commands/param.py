@@ -1,4 +1,4 @@
-"""`flexsheet param`: list, get and set the parameters of the nodes of the running graph."""
+"""`flexsheet param`: get and set the parameters of the nodes of the running graph."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.messages.types import Status
 
-app = make_app("List, get and set parameters of the running graph.")
+app = make_app("Get and set parameters of the running graph.")
 
 STATUS_TIMEOUT_S = 3.0
 """The maximum time to wait for the statuses of nodes, in seconds.
@@ -50,18 +50,37 @@ ParameterArgument = Annotated[
 ]
 
 
-@app.command("list", epilog=examples("flexsheet param list", "flexsheet param list fem_solver"))
-def list_parameters(
-    node: Annotated[
+@app.command(
+    "get",
+    epilog=examples(
+        "flexsheet param get",
+        "flexsheet param get fem_solver",
+        "flexsheet param get fem_solver.prediction_horizon_s",
+    ),
+)
+def get_parameters(
+    given: Annotated[
         str | None,
-        typer.Argument(help="Name of a node; default: all nodes."),
+        typer.Argument(
+            metavar="NODE.PARAM",
+            help="Node, or node and parameter, separated by a dot; default: all nodes.",
+        ),
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the parameters of the running graph, and state which can be changed while it runs."""
+    """Print the value of a parameter of the running graph, or a table of all parameters.
+
+    The table states which parameters can be changed while the graph runs.
+    """
     plan, found = running_graph(run)
-    nodes = [find_node(plan, node)] if node else list(plan.nodes.values())
+    if given is None:
+        nodes = list(plan.nodes.values())
+    elif "." in given:
+        node, name = _find_parameter(plan, given)
+        nodes = [node.model_copy(update={"parameters": {name: node.parameters[name]}})]
+    else:
+        nodes = [find_node(plan, given)]
     live = {one.name: _find_live(one) for one in nodes}
     changed = _read_changes(
         plan, found, {name for name, names in live.items() if names is None or names}
@@ -76,27 +95,12 @@ def list_parameters(
         for name, value in one.parameters.items()
         if name != "apparatus"
     ]
-    if not as_json:
-        for row in rows:
-            row["value"] = json.dumps(row["value"])
-    print_rows(rows, as_json=as_json)
-
-
-@app.command("get", epilog=examples("flexsheet param get fem_solver.prediction_horizon_s"))
-def get_parameter(
-    parameter: ParameterArgument, run: RunOption = None, as_json: JsonOption = False
-) -> None:
-    """Print the value of a parameter of the running graph."""
-    plan, found = running_graph(run)
-    node, name = _find_parameter(plan, parameter)
-    names = _find_live(node)
-    live = {node.name} if names is None or name in names else set()
-    changed = _read_changes(plan, found, live).get(node.name, {})
-    value = changed.get(name, node.parameters[name])
     if as_json:
-        print_json({"parameter": parameter, "value": value})
+        print_json(rows)
+    elif given is not None and "." in given:
+        print(json.dumps(rows[0]["value"]))
     else:
-        print(json.dumps(value))
+        print_rows([{**row, "value": json.dumps(row["value"])} for row in rows], as_json=False)
 
 
 @app.command(
@@ -112,7 +116,7 @@ def set_parameter(
 ) -> None:
     """Change a parameter of a running node; the change is lost when the node restarts.
 
-    `flexsheet param list` shows which parameters can be changed while the graph runs.
+    `flexsheet param get` shows which parameters can be changed while the graph runs.
     """
     from pydantic import ValidationError
     from ruamel.yaml.error import YAMLError

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flexsheet.launch.commands import options
+from flexsheet.launch.commands.arms import describe_arms
 from flexsheet.launch.commands.graph import (
     NoGraphError,
     SeveralGraphsError,
@@ -37,9 +38,11 @@ from flexsheet.launch.commands.output import (
 if TYPE_CHECKING:
     from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
     from flexsheet.launch.running.runs import Run
-    from flexsheet.messages.types import HostStatus, Status
+    from flexsheet.messages.types import ArmState, HostStatus, Status
 
 status_app, logs_app, stop_app, run_app = (options.make_app() for _ in range(4))
+
+ARM_TOPICS = frozenset({"arm_left", "arm_right"})
 
 STATUS_TIMEOUT_S = 3.0
 """The maximum time to wait for the statuses of all nodes, in seconds.
@@ -58,7 +61,7 @@ NodeArgument = Annotated[
 
 @status_app.command(epilog=examples("flexsheet status", "flexsheet status --json"))
 def status(run: options.RunOption = None, as_json: options.JsonOption = False) -> None:
-    """Show the nodes of the running graph, with their message rates, lost messages and notes.
+    """Show the arms and nodes of the running graph, with message rates, lost messages and notes.
 
     If messages were skipped or lost, a line under the table names nodes and topics, and explains
     whether this matters.
@@ -73,7 +76,14 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
     live = list_live_runs()
     statuses: dict[str, Status] = {}
     hosts: dict[str, HostStatus] = {}
-    run_interruptible(_collect_statuses(plan, found, statuses, hosts))
+    arms: dict[str, ArmState] = {}
+    run_interruptible(_collect_statuses(plan, found, statuses, hosts, arms))
+    notes = {
+        str(node.arm_side): statuses[node.name].note_text
+        for node in plan.nodes.values()
+        if node.arm_side and node.name in statuses
+    }
+    arm_rows = describe_arms(arms, notes) if plan.writers.keys() & ARM_TOPICS else []
     rows = [describe_node(node, statuses.get(node.name)) for node in plan.nodes.values()]
     suspicions = _list_suspicions(statuses)
     estops = {name: one.estop for name, one in hosts.items() if one.estop is not None}
@@ -84,6 +94,7 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
                 "launch_file": plan.launch_file,
                 "plan": plan.hash,
                 "running": [str(one.directory) for one in live],
+                "arms": arm_rows,
                 "nodes": rows,
                 "self_checks": suspicions,
                 "estop": estops,
@@ -99,6 +110,9 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
             for name in ("inputs", "outputs", "errors"):
                 del row[name]
             row["note"] = row.pop("note")  # the longest column is the last one
+        if arm_rows:
+            print_rows(arm_rows, as_json=False)
+            print()
         print_rows(rows, as_json=False)
         for line in explanations:
             words.print(line)
@@ -129,19 +143,30 @@ def _print_shown(plan: ResolvedGraph, shown: Run, live: Sequence[Run]) -> None:
 
 
 async def _collect_statuses(
-    plan: ResolvedGraph, run: Run, statuses: dict[str, Status], hosts: dict[str, HostStatus]
+    plan: ResolvedGraph,
+    run: Run,
+    statuses: dict[str, Status],
+    hosts: dict[str, HostStatus],
+    arms: dict[str, ArmState],
 ) -> int:
-    """Receive the statuses of all nodes and hosts for at most STATUS_TIMEOUT_S.
+    """Receive the statuses of all nodes, hosts and arms for at most STATUS_TIMEOUT_S.
 
-    The statuses are stored by name in `statuses` and `hosts`. The result is the exit code 0.
+    The statuses are stored by name in `statuses`, `hosts` and `arms`. The result is the exit code
+    0.
     """
+    arm_topics = plan.writers.keys() & ARM_TOPICS
     handlers: dict[str, Callable[[Any], None]] = {
         "status": lambda message: statuses.update({message.node: message}),
         "host": lambda message: hosts.update({message.host: message}),
+        **dict.fromkeys(arm_topics, lambda message: arms.update({message.side: message})),
     }
 
     def complete() -> bool:
-        return plan.nodes.keys() <= statuses.keys() and plan.hosts.keys() <= hosts.keys()
+        return (
+            plan.nodes.keys() <= statuses.keys()
+            and plan.hosts.keys() <= hosts.keys()
+            and len(arms) == len(arm_topics)
+        )
 
     await receive_until(plan, run, handlers, complete, STATUS_TIMEOUT_S)
     return 0

@@ -58,10 +58,6 @@ def _count_option(default: str) -> Any:
 
 
 CountOption = Annotated[int | None, _count_option("it runs until Ctrl-C")]
-WindowOption = Annotated[
-    float,
-    typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
-]
 REPORT_DELAY_S = 3.0
 """The time (s) after which the command reports that no message has arrived."""
 
@@ -196,50 +192,23 @@ def echo(
     raise typer.Exit(run_interruptible(_read(find_topic(topic), run, show, limit, timeout)))
 
 
-@app.command(epilog=examples("flexsheet topic hz stereo --duration 10"))
+@app.command(epilog=examples("flexsheet topic hz stereo", "flexsheet topic hz frame --json"))
 def hz(
     topic: TopicArgument,
-    duration: WindowOption = 5.0,
+    duration: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
+    ] = 5.0,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the message rate of each writer of a topic, from timestamps and sequence numbers."""
-    print_rows(measure_rates(_measure(topic, run, duration)), as_json=as_json)
+    """Measure the rate, bandwidth and age of the messages of each writer of a topic.
 
-
-@app.command(epilog=examples("flexsheet topic bw stereo", "flexsheet topic bw frame --json"))
-def bw(
-    topic: TopicArgument,
-    duration: WindowOption = 5.0,
-    run: RunOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure the bandwidth of each writer of a topic, in bytes per second."""
-    print_rows(measure_bandwidths(_measure(topic, run, duration)), as_json=as_json)
-
-
-@app.command(epilog=examples("flexsheet topic delay fingertip"))
-def delay(
-    topic: TopicArgument,
-    duration: WindowOption = 5.0,
-    run: RunOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure the age of a topic's data when a message arrives at this command.
-
-    The age is the time since the source timestamp, for instance since the exposure of an image.
-    Messages with timestamps of another computer are ignored, because the clock of that computer can
-    differ.
+    The rate follows from timestamps and sequence numbers. The age is the time from the source
+    timestamp, such as the exposure of an image, until the message arrives at this command. It is
+    not measured for a writer on another computer, because the clock of that computer can differ.
     """
-    from flexsheet.messages.clock import SystemClock
-
-    own = SystemClock().id
-    arrivals = [one for one in _measure(topic, run, duration) if one.header.clock_id == own]
-    if not arrivals:
-        raise CommandError(
-            f'topic "{topic}" has timestamps of another computer; run the command there', FAILED
-        )
-    print_rows(measure_delays(arrivals), as_json=as_json)
+    print_rows(measure_rates(_measure(topic, run, duration)), as_json=as_json)
 
 
 @app.command(
@@ -332,54 +301,41 @@ def _by_writer(arrivals: Sequence[Arrival]) -> list[list[Arrival]]:
 
 
 def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return one row per writer with the rate, lost messages and publication intervals (ms)."""
+    """Return one row per writer with rate, lost messages, bandwidth, and statistics (ms) of times.
+
+    The times are the interval between publications, and the age of the data at arrival.
+    """
     import numpy as np
 
+    from flexsheet.messages.clock import SystemClock
+
+    own_clock = SystemClock().id
     rows = []
     for own in _by_writer(arrivals):
         sequences = np.array([one.header.sequence for one in own])
         stamps_s = np.array([one.header.publish_ns for one in own]) * 1e-9
         span_s = float(stamps_s[-1] - stamps_s[0])
+        received_s = (own[-1].received_ns - own[0].received_ns) * 1e-9
         sent = int(sequences[-1] - sequences[0])
-        steps_ms = np.diff(stamps_s)[np.diff(sequences) == 1] * 1e3
+        sizes = [one.size_bytes for one in own]
+        intervals_ms = np.diff(stamps_s)[np.diff(sequences) == 1] * 1e3
+        ages_ms = [
+            1e-6 * (one.received_ns - one.header.source_ns)
+            for one in own
+            if one.header.clock_id == own_clock
+        ]
         rows.append(
             {
                 "writer": own[0].header.writer,
                 "rate_hz": sent / span_s if span_s > 0 else None,
                 "received": len(own),
                 "lost": int(sent + 1 - len(own)),
-                "interval_ms": _summarize(steps_ms.tolist()),
-            }
-        )
-    return rows
-
-
-def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return one row per writer with the bandwidth (bytes per second) and the message sizes."""
-    rows = []
-    for own in _by_writer(arrivals):
-        sizes = [one.size_bytes for one in own]
-        span_s = (own[-1].received_ns - own[0].received_ns) * 1e-9
-        rows.append(
-            {
-                "writer": own[0].header.writer,
-                "bytes_per_s": sum(sizes[1:]) / span_s if span_s > 0 else None,
-                "messages": len(own),
+                "bytes_per_s": sum(sizes[1:]) / received_s if received_s > 0 else None,
                 "mean_bytes": sum(sizes) / len(sizes),
-                "min_bytes": min(sizes),
-                "max_bytes": max(sizes),
+                "interval_ms": _summarize(intervals_ms.tolist()),
+                "age_ms": _summarize(ages_ms),
             }
         )
-    return rows
-
-
-def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return one row per writer with statistics of the age (ms) of the data at arrival."""
-    rows = []
-    for own in _by_writer(arrivals):
-        ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
-        writer = own[0].header.writer
-        rows.append({"writer": writer, "messages": len(own), "age_ms": _summarize(ages_ms)})
     return rows
 
 

@@ -72,7 +72,7 @@ FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.KEY_MISMATCH: (
         "keys",
         "the host's key differs from its key in the launch file of this computer",
-        "on {host}: flexsheet keys show {host}; here: flexsheet keys install {file} {host} 'KEY'",
+        "on {host}: flexsheet keys new {host}; here: flexsheet keys install {file} {host} 'KEY'",
     ),
     Reachability.KEY_REJECTED: (
         "keys",

@@ -127,9 +127,7 @@ def _load_base(scene_file: Path | None) -> Scene | None:
 
 
 def _compare_scenes(apparatus: Apparatus, scene: Scene, document: Document) -> list[Problem]:
-    remedy = (
-        "name an apparatus file of this scene; flexsheet apparatus sample --scene FILE makes one"
-    )
+    remedy = "name an apparatus file of this scene; flexsheet apparatus seed:N -o FILE makes one"
     if apparatus.scene != scene.name:
         what = f'the file belongs to scene "{apparatus.scene}", but the scene is "{scene.name}"'
         return [document.problem(("scene",), what, remedy)]

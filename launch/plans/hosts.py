@@ -61,7 +61,7 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
             document.report(
                 where,
                 f'"{host.key}" is not a public key',
-                f"give the 40 characters that `flexsheet keys show {name}` prints",
+                f"give the 40 characters that `flexsheet keys new {name}` prints",
             )
         elif host_by_key.setdefault(host.key, name) != name:
             document.report(
