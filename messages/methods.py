@@ -2,7 +2,7 @@
 
 A method family is a set of interchangeable methods for one task (`nodes/methods.py`). The command
 `flexsheet tune SCENE` names the best methods for the key `methods` of a scene. A node uses these
-methods if its parameter has the value `auto`. Any other value of the parameter overrides the scene.
+methods unless a parameter of the launch file overrides them.
 """
 
 from __future__ import annotations
@@ -31,20 +31,17 @@ class SoftBodyChoice(LimitedModel):
 
 
 class Methods(BaseModel):
-    """The methods that a scene chooses for the nodes, one for each task.
-
-    None means that the node uses its default method.
-    """
+    """The methods that a scene chooses for the nodes, one for each task."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    sheet_shape: SheetShapeMethod | None = None
-    correction: Correction | None = None
+    sheet_shape: SheetShapeMethod = "reduced_order"
+    correction: Correction = "two_pass"
     soft_body: SoftBodyChoice | None = None
-    compliance: ComplianceMode | None = Field(
-        default=None,
-        description="how the sheet renders the object's force; "
-        "constant_stretch: the force is not rendered",
+    compliance: ComplianceMode = Field(
+        default="force_curve",
+        description="how the sheet renders the object's force; stiffness: only by the stretch, as "
+        "in Furukawa et al. 2007; constant_stretch: the force is not rendered",
     )
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 
@@ -36,18 +35,6 @@ class Interval:
     value: float
     low: float
     high: float
-
-
-def estimate_rms(errors: NDArray[np.float64]) -> Interval:
-    """Estimate the root mean square of n independent errors (n,), with its confidence interval.
-
-    The interval is computed from the spread of the squared errors.
-    """
-    squares = np.square(errors)
-    mean = float(squares.mean())
-    spread = NORMAL_95 * float(squares.std()) / np.sqrt(len(squares))
-    low, high = np.sqrt([max(0.0, mean - spread), mean + spread])
-    return Interval(float(np.sqrt(mean)), float(low), float(high))
 
 
 def estimate_median(values: Sequence[float]) -> Interval:
@@ -73,8 +60,7 @@ class Trial:
     """A measurement of one method in one benchmark case.
 
     run: function whose time is measured.
-    error: function from the result of `run` to the error in the unit of the method family. The
-        result is an interval if the error is estimated from random samples.
+    error: function from the result of `run` to the error in the unit of the method family.
     in_range: whether the method's valid range includes the case.
     in_scene: whether the scene's working range includes the case.
     size: size of the solved problem, such as {"skin_nodes": 1210}.
@@ -86,7 +72,7 @@ class Trial:
     method: str
     case: Case
     run: Callable[[], Any]
-    error: Callable[[Any], float | Interval]
+    error: Callable[[Any], float]
     in_range: bool
     in_scene: bool = True
     size: Case = field(default_factory=dict)
@@ -131,8 +117,7 @@ class Point:
     extra_metrics: further results, with units in their names.
     reference_uncertainty: uncertainties of the reference. The keys are "error" and the names of
         extra metrics.
-    median_range_s, error_range: limits of the 95 % confidence intervals. None means that the value
-        is exact, or that its random variation was not measured.
+    median_range_s: limits of the 95 % confidence interval of the median.
     """
 
     method: str
@@ -146,13 +131,12 @@ class Point:
     extra_metrics: Mapping[str, float] = field(default_factory=dict)
     reference_uncertainty: Mapping[str, float] = field(default_factory=dict)
     median_range_s: tuple[float, float] | None = None
-    error_range: tuple[float, float] | None = None
 
     def costs(self) -> tuple[Interval, Interval]:
-        """Return the method's costs: median time and error, with their confidence intervals."""
+        """Return the method's costs: median time with its confidence interval, and error."""
         return (
             Interval(self.median_s, *(self.median_range_s or (self.median_s, self.median_s))),
-            Interval(self.error, *(self.error_range or (self.error, self.error))),
+            Interval(self.error, self.error, self.error),
         )
 
 
@@ -169,20 +153,19 @@ def measure(trial: Trial, *, repeats: int) -> Point:
         durations.append(time.perf_counter() - start)
         if len(durations) >= MIN_REPEATS and sum(durations) > MAX_TRIAL_S:
             break
-    median, error = estimate_median(durations), trial.error(result)
+    median = estimate_median(durations)
     return Point(
         method=trial.method,
         case=trial.case,
         params={**trial.case, **trial.size},
         median_s=median.value,
         p99_s=float(np.quantile(durations, 0.99)),
-        error=error.value if isinstance(error, Interval) else float(error),
+        error=float(trial.error(result)),
         in_range=bool(trial.in_range),
         in_scene=bool(trial.in_scene),
         extra_metrics=dict(trial.extra_metrics(result)),
         reference_uncertainty=dict(trial.reference_uncertainty),
         median_range_s=(median.low, median.high),
-        error_range=(error.low, error.high) if isinstance(error, Interval) else None,
     )
 
 

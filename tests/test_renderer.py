@@ -142,7 +142,8 @@ def test_nearest_surface_hides_what_is_behind(
             np.concatenate([triangles, triangles + 4]).astype(np.int32),
         )
         canvas = Canvas(context, (80, 60), surface, stage._material())
-        canvas.draw_unresolved(view, DrawStyle(flat=False, pattern="object"))
+        canvas.begin(multisampled=True)
+        canvas.draw_into(canvas.target, view, DrawStyle(flat=False, pattern="object"))
         canvas.resolve()
         picture = canvas.read()
         assert picture[30, 40, 0] > 200

@@ -180,7 +180,7 @@ def _print_methods(result: dict[str, Any]) -> None:
             f"{one['inside']} of {one['cases']}",
             "front" if one["front"] else "",
         )
-        for one in summarize_methods(result["points"])
+        for one in summarize_methods(result)
     ]
     error = f"error, {result['unit']}"
     print_table(("method", "median", "p99", error, "outside", "cases in range", ""), rows)

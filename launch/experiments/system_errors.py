@@ -174,8 +174,8 @@ class ErrorEvaluator:
             self.scene,
             self.calibrations,
             metres_per_px=METRES_PER_PX,
-            correction=methods.correction or "two_pass",
-            sheet_shape=methods.sheet_shape or "reduced_order",
+            correction=methods.correction,
+            sheet_shape=methods.sheet_shape,
         )
         maps = evaluator.evaluate(self.apparatus, frozenset({Metric.IMAGE})).image_m or ()
         sizes_mm = [1e3 * np.linalg.norm(one, axis=2).ravel() for one in maps]

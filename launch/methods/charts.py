@@ -244,11 +244,11 @@ def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
             "| cases in range | front |"
         )
         yield "|---|---|---|---|---|---|---|"
-        yield from map(_overview_row, summarize_methods(result["points"]))
+        yield from map(_overview_row, summarize_methods(result))
         yield ""
 
 
-def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def summarize_methods(result: dict[str, Any]) -> list[dict[str, Any]]:
     """Return one row per method, with the largest time and error over the measured cases.
 
     The time of a case is given as median and 99 % quantile. Each row also contains the number of
@@ -256,9 +256,8 @@ def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     separately.
     """
     rows = []
-    front = pareto_front([Point(**point) for point in points if _has_reference(point)])
-    for method in dict.fromkeys(point["method"] for point in points):
-        own = [point for point in points if point["method"] == method]
+    for method in _list_methods(result):
+        own = [point for point in result["points"] if point["method"] == method]
         inside = [point for point in own if point["in_range"] and _has_reference(point)]
         rows.append(
             {
@@ -276,7 +275,7 @@ def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 ),
                 "cases": len(own),
                 "inside": len(inside),
-                "front": method in front,
+                "front": method in result["front"],
             }
         )
     return rows

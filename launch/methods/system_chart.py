@@ -66,11 +66,7 @@ NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
 }
 """For each key of `Methods`, the node type and the node parameter that select the method."""
 
-EXACT = Methods(
-    sheet_shape="reduced_order",
-    correction="two_pass",
-    soft_body=SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.0045),
-)
+EXACT = Methods(soft_body=SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.0045))
 
 PAPER = Methods(
     sheet_shape="four_triangles",
@@ -103,9 +99,7 @@ class Configuration:
         chosen = [("fem_solver", "compute_table=false")]
         chosen += [("planner", f"{key}={value}") for key, value in self.planner.items()]
         for key, (node_type, parameter) in NODE_PARAMETERS.items():
-            method = getattr(self.methods, key)
-            if method is not None:
-                chosen.append((node_type, f"{parameter}={method}"))
+            chosen.append((node_type, f"{parameter}={getattr(self.methods, key)}"))
         if self.methods.soft_body is not None:
             body = self.methods.soft_body
             chosen.append(("fem_solver", f"method={body.method}"))

@@ -211,7 +211,7 @@ def tune(
     family is raised.
     """
     choices: list[Choice] = []
-    shape: str = scene.methods.sheet_shape or "reduced_order"
+    shape: str = scene.methods.sheet_shape
     for tunable in tunables:
         family, settings = find_family(tunable.name), dict(tunable.settings)
         if tunable.name == "correction":

@@ -5,11 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.methods import SheetShapeMethod, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole, node_class
 from flexsheet.nodes.cache import default_cache_dir
@@ -38,16 +36,10 @@ def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
     for node in plan.nodes.values():
         if issubclass(node_class(node.type), node_class("planner")):
             load_or_compute_bounds(scene.camera.rate_hz, node.parameters["cache_dir"], progress)
-        if node.role is NodeRole.RENDERER and _uses_deflection_shapes(
-            scene, node.parameters["sheet_shape"]
-        ):
-            precompute_deflection_shapes(scene, node.parameters["cache_dir"], progress)
-
-
-def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
-    """Return whether a renderer needs precomputed deflection shapes to draw a pushed sheet."""
-    shape: SheetShapeMethod = resolve_method(requested, scene.methods.sheet_shape, "reduced_order")
-    return shape == "reduced_order"
+        if node.role is NodeRole.RENDERER:
+            shape = node.parameters["sheet_shape"] or scene.methods.sheet_shape
+            if shape == "reduced_order":
+                precompute_deflection_shapes(scene, node.parameters["cache_dir"], progress)
 
 
 def precompute_deflection_shapes(

@@ -12,13 +12,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from enum import Enum, auto
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
@@ -158,7 +156,7 @@ class EyeViewRequester:
     def __init__(self, publish: Publish, scene: Scene) -> None:
         self._publish = publish
         self.enabled = False
-        self.chosen_correction: Correction | Literal["auto"] = "auto"
+        self.chosen_correction: Correction | None = None
         self.state = EyeViewState.RESTING
         self._by_scene = scene.methods.correction
         self._owns_display = self._borrowed = False
@@ -175,7 +173,7 @@ class EyeViewRequester:
     @property
     def correction(self) -> Correction:
         """Return the image correction that a viewer has chosen, or that the scene specifies."""
-        return resolve_method(self.chosen_correction, self._by_scene, "two_pass")
+        return self.chosen_correction or self._by_scene
 
     def waited_s(self, now_s: float) -> float:
         """Return the time (s) since the state of the request last changed."""

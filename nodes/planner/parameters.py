@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from pydantic import Field
 
-from flexsheet.messages.methods import ComplianceMode, resolve_method
+from flexsheet.messages.methods import ComplianceMode
 from flexsheet.messages.scene import NonNegative, Positive, Scene
 from flexsheet.nodes.models.motion import SheetBounds
 from flexsheet.nodes.node import NodeParameters
@@ -34,12 +33,12 @@ class PlannerParameters(NodeParameters):
     max_actuation_delay_s: Positive = Field(
         default=0.15, description="maximum actuation delay that is measured and used, s"
     )
-    compliance_mode: ComplianceMode | Literal["auto"] = Field(
-        default="auto",
-        description="force_curve: render the object's force over depth, by stretch and offset of "
-        "the sheet; stiffness: render the object's stiffness by the stretch alone (Furukawa et al. "
-        "2007); constant_stretch: render no force; auto: the mode in the scene's methods, "
-        "otherwise force_curve. For a rigid object, constant_stretch is always used",
+    compliance_mode: ComplianceMode | None = Field(
+        default=None,
+        description="rendering of the object's force. force_curve: render the force as a function "
+        "of depth; stiffness: match only the stiffness, by the stretch (Furukawa et al. 2007); "
+        "constant_stretch: render no force; null: the mode of the scene. For a rigid object, "
+        "constant_stretch is always used",
     )
 
     def choose_compliance(self, scene: Scene) -> ComplianceMode:
@@ -49,7 +48,7 @@ class PlannerParameters(NodeParameters):
         """
         if scene.object.material is None:
             return "constant_stretch"
-        return resolve_method(self.compliance_mode, scene.methods.compliance, "force_curve")
+        return self.compliance_mode or scene.methods.compliance
 
     sheet_calibration: SheetCalibrationFile | None = Field(
         default=None,

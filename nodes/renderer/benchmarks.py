@@ -1,23 +1,22 @@
 """Measure the time and the image error of the methods that correct the projected image.
 
-The time is measured for drawing a stereo frame, without reading its pixels. The method
-`lower_bound` draws the same triangles once for each eye, without any correction. Its time is a
-lower bound for the other methods. The error is measured at each point that the eye sees on a
-reference sheet. The caller computes the reference sheet independently of the renderer.
+The time is measured for drawing a stereo frame, without reading its pixels. The error is measured
+at each point that the eye sees on a reference sheet. The caller computes the reference sheet
+independently of the renderer.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 
-from flexsheet.messages.scene import Cylinder, Scene, require_cylinder, require_projector
+from flexsheet.messages.scene import Cylinder, Scene, require_cylinder
 from flexsheet.messages.types import Correction, Display, Pattern
 from flexsheet.nodes.arrays import Floats, Image
-from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.methods import Family, Trial
 from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import edge_poses
@@ -38,22 +37,15 @@ sheet's left and right edges, and the fingertip (3,), m. The fingertip is None i
 pushed."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
-LOWER_BOUND, TWO_PASS_TRIANGLES = "lower_bound", "two_pass_triangles"
-"""The names of two benchmark methods. The first measures a lower bound on the drawing time. The
-second is the method two_pass with a sheet mesh of four triangles."""
-CORRECTION_OF: dict[str, Correction] = {
-    LOWER_BOUND: "none",
-    **{correction: correction for correction in CORRECTIONS},
-    TWO_PASS_TRIANGLES: "two_pass",
-}
-METHODS = tuple(CORRECTION_OF)
+TWO_PASS_TRIANGLES = "two_pass_triangles"
+"""The name of the method two_pass with a sheet mesh of four triangles."""
+
+METHODS = (*CORRECTIONS, TWO_PASS_TRIANGLES)
 CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
 )
 """The cases of the benchmark: pairs of the sheet's tilt (degrees) and the push depth (mm)."""
-LARGE_CASES: tuple[tuple[float, float], ...] = ((-30, 0), (0, 30))
-SIZES_PX = ((800, 600), (1280, 720))
 STRETCH = 1.05
 SPACING_M = 0.0025
 
@@ -88,7 +80,6 @@ def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     if method == "none":
         return tilt_deg == 0 and push_mm == 0
     deepest_mm = {
-        LOWER_BOUND: -1.0,
         "four_triangles": max_triangles_mm,
         TWO_PASS_TRIANGLES: max_triangles_mm,
         "two_pass": 60.0,
@@ -133,56 +124,28 @@ def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
     return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 
 
-def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """Return a copy of the scene with another projector resolution.
-
-    The width of the illuminated area does not change.
-    """
-    projector = require_projector(scene)
-    lens, scale = projector.lens, width_px / projector.width_px
-    cut = 0.5 * (projector.height_px * scale - height_px)
-    lens = lens.model_copy(
-        update={
-            "fx_px": lens.fx_px * scale,
-            "fy_px": lens.fy_px * scale,
-            "cx_px": (lens.cx_px + 0.5) * scale - 0.5,
-            "cy_px": (lens.cy_px + 0.5) * scale - 0.5 - cut,
-        }
-    )
-    size = {"width_px": width_px, "height_px": height_px, "lens": lens}
-    return scene.model_copy(update={"projector": projector.model_copy(update=size)})
-
-
 def _trials(reference: ReferenceFactory, scene: Scene) -> Iterator[Trial]:
-    basis = deflection_cache.load_or_compute(scene, None)
     context = headless_context()
+    scene_renderer = SceneRenderer(
+        scene,
+        context,
+        spacing_m=SPACING_M,
+        basis=deflection_cache.load_or_compute(scene, None),
+    )
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
-    for size in SIZES_PX:
-        shown = scale_projector(scene, *size)
-        scene_renderer = SceneRenderer(shown, context, spacing_m=SPACING_M, basis=basis)
-        cases = (*CASES, *scene_cases(scene)) if size == SIZES_PX[0] else LARGE_CASES
-        for tilt_deg, push_mm in dict.fromkeys(cases):
-            if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
-                continue
-            case: Case = {
-                "tilt_deg": tilt_deg,
-                "push_mm": push_mm,
-                "width_px": size[0],
-                "height_px": size[1],
-            }
-            sheet, get_measure = _make_situation(
-                shown, reference, tilt_deg=tilt_deg, push_mm=push_mm
+    for tilt_deg, push_mm in dict.fromkeys((*CASES, *scene_cases(scene))):
+        if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
+            continue
+        sheet, get_measure = _make_situation(scene, reference, tilt_deg=tilt_deg, push_mm=push_mm)
+        for method in METHODS:
+            yield Trial(
+                method=method,
+                case={"tilt_deg": tilt_deg, "push_mm": push_mm},
+                run=partial(draw_stereo, scene_renderer, method, sheet),
+                error=partial(_error_mm, scene_renderer, method, sheet, get_measure),
+                in_range=is_in_range(method, tilt_deg=tilt_deg, push_mm=push_mm),
+                in_scene=abs(tilt_deg) <= largest_deg,
             )
-            in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
-            for method in METHODS:
-                yield Trial(
-                    method=method,
-                    case=case,
-                    run=partial(draw_stereo, scene_renderer, method, sheet),
-                    error=partial(_error_mm, scene_renderer, method, sheet, get_measure),
-                    in_range=is_in_range(method, tilt_deg=tilt_deg, push_mm=push_mm),
-                    in_scene=in_scene,
-                )
     context.release()
 
 
@@ -203,14 +166,14 @@ def _make_situation(
 
 
 def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """Draw one stereo frame by a correction method, or by the method `LOWER_BOUND`."""
-    display = Display(correction=CORRECTION_OF[method], stereo="side_by_side")
+    """Draw one stereo frame by a correction method."""
+    display = Display(correction=_get_correction(method), stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
-    if method == LOWER_BOUND:
-        for eye in scene_renderer.eyes(display):
-            scene_renderer.canvas.draw_unresolved(scene_renderer.view(eye), look)
-    else:
-        _draw(scene_renderer, method, display, sheet, look, read=False)
+    _draw(scene_renderer, method, display, sheet, look, read=False)
+
+
+def _get_correction(method: str) -> Correction:
+    return "two_pass" if method == TWO_PASS_TRIANGLES else cast(Correction, method)
 
 
 def _draw(
@@ -237,7 +200,7 @@ def draw_coordinate_ramps(
     """
     images = []
     for pattern in COORDINATE_RAMPS:
-        display = Display(correction=CORRECTION_OF[method], stereo="mono", pattern=pattern)
+        display = Display(correction=_get_correction(method), stereo="mono", pattern=pattern)
         look = DrawStyle(flat=True, pattern=pattern)
         image = _draw(scene_renderer, method, display, sheet, look, read=True)
         assert image is not None

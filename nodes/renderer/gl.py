@@ -189,15 +189,6 @@ class Canvas:
         """
         self._object.move(moved)
 
-    def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw an image, but do not average the samples of each pixel.
-
-        Benchmarks use the time that this method needs as a lower bound for all correction methods.
-        """
-        self.begin(multisampled=True)
-        self.draw_into(self.target, view, look)
-        self.context.finish()
-
     def begin(self, *, multisampled: bool) -> None:
         """Set `target` to the framebuffer for the next image, and clear this framebuffer."""
         self.target = self._frame if multisampled else self._single

@@ -6,7 +6,6 @@ import asyncio
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.methods import resolve_method
 from flexsheet.messages.notes import NoteCode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
@@ -93,7 +92,7 @@ class Renderer(Node):
         self._output.open((scene.projector.width_px, scene.projector.height_px))
         given = self.parameters
         if self.display.message is None:
-            correction = resolve_method(given.correction, scene.methods.correction, "two_pass")
+            correction = given.correction or scene.methods.correction
             one_view = given.stereo == "auto" and scene.eyes.interocular_m == 0.0
             stereo = "side_by_side" if given.stereo == "auto" else given.stereo
             self._shown = self._shown.model_copy(
@@ -105,9 +104,7 @@ class Renderer(Node):
             spacing_m=given.spacing_m,
             samples=given.samples,
             basis=deflection_cache.load(scene, given.cache_dir),
-            sheet_shape=resolve_method(
-                given.sheet_shape, scene.methods.sheet_shape, "reduced_order"
-            ),
+            sheet_shape=given.sheet_shape or scene.methods.sheet_shape,
         )
         latency = DisplayLatencyEstimator(
             first_s=given.prediction_horizon_s,

@@ -66,15 +66,15 @@ class RendererParameters(NodeParameters):
         "a GPU. null: 4 samples are used. For two_pass without a GPU, null means a higher "
         "resolution without multisampling.",
     )
-    correction: Correction | Literal["auto"] = Field(
-        default="auto",
-        description="Correction method until a display message sets it. auto: the method that the "
-        "scene specifies is used, or two_pass if the scene specifies none.",
+    correction: Correction | None = Field(
+        default=None,
+        description="Correction method until a display message sets it. null: the method of the "
+        "scene.",
     )
-    sheet_shape: SheetShapeMethod | Literal["auto"] = Field(
-        default="auto",
+    sheet_shape: SheetShapeMethod | None = Field(
+        default=None,
         description="Method that computes the sheet's shape for the correction method two_pass. "
-        "auto: the method of the scene, or reduced_order if the scene specifies none.",
+        "null: the method of the scene.",
     )
     cache_dir: Path | None = Field(
         default=None,
