@@ -21,6 +21,7 @@ from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 from flexsheet.nodes.renderer.benchmarks import roll_sheet
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.sheet import SheetPose
+from flexsheet.nodes.twin import eye_node
 from flexsheet.nodes.twin.eye import (
     METRES_PER_PX,
     NotMeasurableError,
@@ -241,8 +242,8 @@ def test_row_of_figure_13(bench: CorrectionBench) -> None:
 
 
 class EyeBench(NodeHarness[TwinEyeNode, VirtualClock]):
-    def __init__(self, scene: Scene, **parameters: object) -> None:
-        given = TwinEyeParameters(metres_per_px=0.002, **parameters)
+    def __init__(self, scene: Scene) -> None:
+        given = TwinEyeParameters(metres_per_px=0.002)
         super().__init__(TwinEyeNode, given, VirtualClock(10**10), name="twin_eye")
         self.scene = scene
 
@@ -335,7 +336,8 @@ async def test_eye_node_renders_each_label_once(scene: Scene) -> None:
 async def test_eye_node_reports_a_missing_image_and_continues(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench = EyeBench(scene, max_queue=2)
+    monkeypatch.setattr(eye_node, "MAX_QUEUE", 2)
+    bench = EyeBench(scene)
     await bench.ready()
     real = bench.node._camera.take
 
@@ -345,7 +347,7 @@ async def test_eye_node_reports_a_missing_image_and_continues(
 
     monkeypatch.setattr(bench.node._camera, "take", fails_once)
     await bench.show(*(frame(label) for label in ("a", "b", "c", "c")))
-    assert "increase max_queue" in bench.node.last_error
+    assert "2 frames are waiting" in bench.node.last_error
     assert bench.node.errors == 1
     await bench.finish()
     assert bench.node.errors == 2

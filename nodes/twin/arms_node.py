@@ -27,7 +27,6 @@ from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
     ArmServer,
     Controller,
-    Fault,
     PlacedArm,
     check_loopback,
 )
@@ -74,13 +73,6 @@ class TwinArmsParameters(SimulatorParameters):
         description="file that stores the joint angles, so that a restart does not move the arms; "
         "null: the angles are not stored",
     )
-    fault: Fault = Field(
-        default="none", description="simulated fault of the arm on the side `fault_side`"
-    )
-    fault_side: Literal["left", "right"] = "left"
-    fault_after_s: NonNegative = Field(
-        default=0.0, description="time from the start of the arms until the fault begins, s"
-    )
 
 
 def open_joints_file(path: str | None) -> dict[str, Floats]:
@@ -121,7 +113,6 @@ class TwinArmsNode(Node):
         self._placed: dict[str, PlacedArm] = {}
         self._pull: SheetPull | None = None
         self._moved_ns: dict[str, int] = {}
-        self._started_ns = 0
         self._stored_joints = open_joints_file(self.parameters.joints_file)
 
     async def close(self) -> None:
@@ -137,12 +128,11 @@ class TwinArmsNode(Node):
         self._pull = SheetPull.of(scene.sheet, truth)
         if len(self.servers) == len(arms):
             return
-        self._started_ns = self.clock.now_ns()
         for number, side in enumerate(arms):
             if side in self.servers:
                 continue
             port = self.parameters.left_port if side == "left" else self.parameters.right_port
-            self._moved_ns[side] = self._started_ns
+            self._moved_ns[side] = self.clock.now_ns()
             joints_rad = self._stored_joints[side]
             if not self._placed[side].mechanics.is_in_range(joints_rad):
                 joints_rad = self._start_joints(side, scene)
@@ -221,9 +211,6 @@ class TwinArmsNode(Node):
             return
         for side in self.servers:
             self._advance(side)
-        given, since_ns = self.parameters, self.clock.now_ns() - self._started_ns
-        if given.fault != "none" and since_ns > given.fault_after_s * 1e9:
-            self.servers[given.fault_side].controller.fault = given.fault
         joints = {
             side: self._true_joints(side, server.controller.servo.driven_rad)
             for side, server in self.servers.items()

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.notes import NoteCode
-from flexsheet.messages.scene import Positive, Projector, Scene
+from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.types import (
     Display,
     Eye,
@@ -32,11 +32,23 @@ from flexsheet.nodes import OmissionReason
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation
-from flexsheet.nodes.twin.render_queue import RenderQueue
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus, find_display_delay_s
 from flexsheet.nodes.twin.viewer import HeadSway
 
+Key = tuple[str, ...]
+"""The label, correction method and eye of a frame. They identify a rendering job."""
+
 Job = tuple[EyeSituation, Floats, Frame, Header]
+
+MAX_QUEUE = 32
+"""The maximum number of frames that wait to be rendered."""
+
+MIN_INTERVAL_NS = 5_000_000_000
+"""The minimum time (ns) between two rendered frames with the same key."""
+
+MAX_EYE_AGE_S = 0.1
+"""The maximum age (s) of the tracked eye position. If the position is older, the eyes of the scene
+are used."""
 
 
 class TwinEyeParameters(SimulatorParameters):
@@ -44,22 +56,6 @@ class TwinEyeParameters(SimulatorParameters):
 
     metres_per_px: Positive = Field(
         default=METRES_PER_PX, description="size of a pixel on the screen plane, m"
-    )
-    max_queue: int = Field(
-        default=32, ge=1, description="maximum number of frames that wait to be rendered"
-    )
-    projector: Projector | None = Field(
-        default=None,
-        description="true projector, in the format of the scene file; null: the scene's "
-        "projector is used",
-    )
-    eye_stale_s: Positive = Field(
-        default=0.1,
-        description="maximum age of the tracked eye position, s; if the position is older, the "
-        "eyes of the scene are used",
-    )
-    min_interval_s: Positive = Field(
-        default=5.0, description="minimum time between two rendered frames of the same label, s"
     )
     viewpoint: Viewpoint = Field(
         default="centre",
@@ -104,7 +100,8 @@ class TwinEyeNode(Node):
         self._camera = EyeCamera()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=self.name)
         given = self.parameters
-        self._queue = RenderQueue[Job](given.max_queue, given.min_interval_s)
+        self._jobs: dict[Key, Job] = {}
+        self._rendered_ns: dict[Key, int] = {}
         self._before_light: tuple[Frame, Header] | None = None
         self._task: asyncio.Task[None] | None = None
         self._scenes: tuple[Scene, Scene] | None = None
@@ -112,7 +109,7 @@ class TwinEyeNode(Node):
         self._sway = None if truth is None else HeadSway.drawn(truth.eyes, given.seed)
 
     async def close(self) -> None:
-        self._queue.clear()
+        self._jobs.clear()
         if self._task is not None:
             await asyncio.gather(self._task, return_exceptions=True)
         self._worker.shutdown()
@@ -122,23 +119,20 @@ class TwinEyeNode(Node):
             await self._task
 
     def on_frame(self, frame: Frame, header: Header) -> None:
-        key = (frame.label, frame.correction, frame.eye)
-        if not frame.pixels or not frame.label or self._queue.is_known(key, self.clock.now_ns()):
+        key, now_ns = (frame.label, frame.correction, frame.eye), self.clock.now_ns()
+        if not frame.pixels or not frame.label or key in self._jobs:
+            return
+        if key in self._rendered_ns and now_ns - self._rendered_ns[key] < MIN_INTERVAL_NS:
             return
         if self.scene.message is None or self.twin__arms.message is None:
             self.set_note(NoteCode.WAITING_FOR_SCENE)
         elif frame.stereo != "mono" and frame.eye == "both":
             text = f'"{frame.label}" has two views ({frame.stereo})'
             self.set_note(NoteCode.FRAME_NOT_RENDERED, text)
-        elif self._queue.is_full:
-            if self._queue.reject(key):
-                self.report_error(
-                    "on_frame",
-                    OverflowError(
-                        f'frame "{frame.label}" is not rendered, because max_queue = '
-                        f"{self.parameters.max_queue} frames are waiting; increase max_queue"
-                    ),
-                )
+        elif len(self._jobs) >= MAX_QUEUE:
+            self._rendered_ns[key] = now_ns
+            text = f'frame "{frame.label}" is not rendered, because {MAX_QUEUE} frames are waiting'
+            self.report_error("on_frame", OverflowError(f"{text}; use fewer labels at a time"))
         elif self._before_light is None:
             self._before_light = (frame, header)
 
@@ -156,17 +150,14 @@ class TwinEyeNode(Node):
         situation = self._collect_situation(true_scene, arms)
         eye = self._true_eye(true_scene, light_ns * 1e-9, self._viewpoint(frame))
         key = (frame.label, frame.correction, frame.eye)
-        self._queue.add(key, (situation, eye, frame, frame_header))
+        self._jobs[key] = (situation, eye, frame, frame_header)
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
     def _true_scene(self, scene: Scene) -> Scene:
         """Return the scene with the true parameters of the devices; the result is cached."""
         if self._scenes is None or self._scenes[0] is not scene:
-            true = apply_apparatus(scene, self.parameters.apparatus)
-            if self.parameters.projector is not None:
-                true = true.model_copy(update={"projector": self.parameters.projector})
-            self._scenes = scene, true
+            self._scenes = scene, apply_apparatus(scene, self.parameters.apparatus)
         return self._scenes[1]
 
     def _collect_situation(self, true_scene: Scene, arms: TwinArms) -> EyeSituation:
@@ -198,7 +189,7 @@ class TwinEyeNode(Node):
         head motion is added.
         """
         given = self.parameters
-        tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None
+        tracked = self.eye.message if self.eye.age_s() <= MAX_EYE_AGE_S else None
         centre, right = true_scene.eyes.centre_world_m, np.array([1.0, 0.0, 0.0])
         if tracked is not None and tracked.valid:
             centre = tracked.centre_world_m
@@ -213,10 +204,11 @@ class TwinEyeNode(Node):
         return np.asarray(centre + (aside_m if viewpoint == "right" else -aside_m) * right)
 
     async def _picture_all(self) -> None:
-        while self._queue:
-            key, (situation, eye, frame, header) = self._queue.next()
-            await self.call("picture", self._picture, situation, eye, frame, header)
-            self._queue.finish(key, self.clock.now_ns())
+        while self._jobs:
+            key, job = next(iter(self._jobs.items()))
+            await self.call("picture", self._picture, *job)
+            self._jobs.pop(key, None)
+            self._rendered_ns[key] = self.clock.now_ns()
 
     async def _picture(
         self, situation: EyeSituation, eye: Floats, frame: Frame, header: Header

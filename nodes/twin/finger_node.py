@@ -44,6 +44,9 @@ JITTER_STREAM = 1
 """The second element of the random seed for the jitter of exposure times. It makes the jitter
 independent of the image noise."""
 
+REST_WORLD_M = (0.0, 0.0, 0.08)
+"""The world position (m) of the finger before the first path."""
+
 
 class TwinFingerParameters(SimulatorParameters):
     """The parameters of the simulated finger and stereo camera."""
@@ -51,10 +54,6 @@ class TwinFingerParameters(SimulatorParameters):
     seed: int = Field(
         default=2006,
         description="random seed of the finger's wander and tremor and of the image noise",
-    )
-    rest_world_m: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, 0.08),
-        description="position of the finger before the first path, world frame, m",
     )
     transfer_s: NonNegative = Field(
         default=0.004, description="duration of the image read-out after the exposure, s"
@@ -132,8 +131,8 @@ class TwinFingerNode(Node):
         truth = self.parameters.apparatus
         true_scene = apply_apparatus(scene, truth)
         if self.camera is None:
-            rest = np.array(self.parameters.rest_world_m)
-            self.motion = FingerMotion.of(self._true_finger, rest, seed=self.parameters.seed)
+            rest_m = np.array(REST_WORLD_M)
+            self.motion = FingerMotion.of(self._true_finger, rest_m, seed=self.parameters.seed)
             self.motion_from_ns = self.clock.now_ns()
         self.camera = TwinCamera(
             make_true_camera(true_scene.camera),
