@@ -13,7 +13,6 @@ from flexsheet.launch.commands.options import split_names
 from flexsheet.launch.experiments import finger_paths, select_names
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.twin.finger import FingerPathError
 from tests.commands import Command
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,7 +46,7 @@ def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:
     wrong = r'stopp: neither a gesture nor a file; did you mean "stop"\?'
     with pytest.raises(BadInputError, match=wrong):
         finger_paths.finger_path(launch_file, "stopp")
-    with pytest.raises(FingerPathError, match=r"absent\.csv: the file cannot be read"):
+    with pytest.raises(BadInputError, match=r"absent\.csv: cannot be read"):
         finger_paths.finger_path(launch_file, str(tmp_path / "absent.csv"))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ from flexsheet.nodes.twin.gestures import (
     tap,
     tap_fast,
 )
-from flexsheet.nodes.twin.paths import map_to_surface, recorded_path
+from flexsheet.nodes.twin.paths import map_to_surface, place_recording
 from tests.examples import examples, long_except
 from tests.scenes import load_values
 
@@ -318,15 +317,13 @@ def test_a_turned_object_is_touched_from_the_users_side() -> None:
     np.testing.assert_allclose(map_to_surface(SCENE, places)[0], [0.01, 0.0, 0.02], atol=1e-9)
 
 
-def test_a_recorded_hand_keeps_what_it_did_between_its_samples(tmp_path: Path) -> None:
+def test_a_recorded_hand_keeps_what_it_did_between_its_samples() -> None:
     """A tremor of 8 Hz that was recorded at 48 Hz keeps its amplitude."""
     t = np.arange(0.0, 6.0, 1.0 / 48.0)
     tremor_mm = 0.2 * np.sin(2.0 * np.pi * 8.0 * t)
     # Depths such that this hand hovers where its tremor shows: along the object.
-    rows = np.stack([t, 15.0 * np.sin(t) + tremor_mm, 10.0 * np.cos(t), 20.0 + 20.0 * np.sin(t)])
-    text = "\n".join(["t_s,x_mm,y_mm,z_mm", *(",".join(map(str, row)) for row in rows.T)])
-    (tmp_path / "hand.csv").write_text(text)
-    path = recorded_path(tmp_path / "hand.csv", SCENE)
+    rows = np.stack([15.0 * np.sin(t) + tremor_mm, 10.0 * np.cos(t), 20.0 + 20.0 * np.sin(t)])
+    path = place_recording("hand", t, 1e-3 * rows.T, SCENE)
     motion = motion_on(path, SCENE, steady=True)
     times = np.arange(1.0, 5.0, 2e-3)
     along = np.array([motion.at(0.3 + time).position[0] for time in times])

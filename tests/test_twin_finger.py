@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from flexsheet.launch.experiments.finger_paths import recorded_path
+from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.notes import NoteCode
@@ -23,7 +25,6 @@ from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
 from flexsheet.messages.wire import WireError, decode, encode
 from flexsheet.nodes.twin.finger import FingerMotion, FingerPathError
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
-from flexsheet.nodes.twin.paths import recorded_path
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from tests.note_text import note_text
@@ -227,18 +228,18 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("text", "printed"),
     [
-        ("", "not name the column t_s"),
-        ("t_s,x_mm,y_mm\n0,1,2\n", "not name the column z_mm"),
-        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,a,2,3\n", "line 3"),
-        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,nan,2,3\n", "line 3: a value is not finite"),
-        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n0,1,2,3\n", "line 3: t_s does not increase"),
+        ("", "is empty"),
+        ("t_s,x_mm,y_mm\n0,1,2\n", "z_mm: missing column"),
+        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,a,2,3\n", 'csv:3: x_mm: expected a number, found "a"'),
+        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,nan,2,3\n", "csv:3: x_mm: expected a finite number"),
+        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n0,1,2,3\n", "csv:3: t_s: does not increase"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n", "give a path with at least two samples"),
     ],
 )
 def test_a_bad_recording_is_rejected(tmp_path: Path, scene: Scene, text: str, printed: str) -> None:
-    with pytest.raises(FingerPathError, match=printed):
+    with pytest.raises(BadInputError, match=printed):
         recorded_path(write_recording(tmp_path / "hand.csv", text), scene)
-    with pytest.raises(FingerPathError, match="cannot be read"):
+    with pytest.raises(BadInputError, match="cannot be read"):
         recorded_path(tmp_path / "absent.csv", scene)
 
 

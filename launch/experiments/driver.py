@@ -55,7 +55,6 @@ READ = (
     "arm_right",
     "skin",
     "soft_body",
-    "force",
     "status",
     "host",
 )

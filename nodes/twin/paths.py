@@ -10,8 +10,6 @@ defined in surface positions apply to the object of any scene.
 from __future__ import annotations
 
 import pickle
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import scipy
@@ -292,12 +290,13 @@ def place_path(
     )
 
 
-def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
-    """Load a recorded fingertip path, and map the path to the scene's object.
+def place_recording(label: str, times_s: Floats, points: Floats, scene: Scene) -> FingerPath:
+    """Map the recorded motion of a fingertip to the scene's object.
 
-    The label of the path is the file name. The file has the columns t_s, x_mm, y_mm and z_mm, with
-    y upwards, as hand trackers write them. The mapping preserves the motion and changes its
-    location:
+    times_s (n,): ascending times.
+    points (n, 3): positions, m, with y upwards, as hand trackers write them.
+
+    The mapping preserves the motion and changes its location:
 
     1. Rotate: the recorded x, y, z become the world's x, y, z (right, up, towards the user).
     2. Scale, if necessary, by one factor. Then the central 90 % of each coordinate fit the
@@ -310,11 +309,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
 
     The samples are limited to the scene's finger volume and joined by a spline, which preserves the
     recorded tremor.
-
-    Raises FingerPathError if the file is invalid.
     """
-    recorded = _read_recording(csv_path)
-    times_s, points = recorded[:, 0] - recorded[0, 0], recorded[:, 1:] * 1e-3
     points = points - np.median(points, axis=0)
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     extent = np.array([*touchable(scene), 0.05])
@@ -336,7 +331,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
         map_to_surface(scene, places), scene.finger.volume_min_m, scene.finger.volume_max_m
     )
     return FingerPath(
-        label=csv_path.stem,
+        label=label,
         times_s=limit_path_speed(scene, times_s, within),
         positions_world_m=within,
         wander_m=0.0,
@@ -357,49 +352,3 @@ def _soft_clip(values: Floats, half: float) -> Floats:
     The width of the transition at each limit is 0.2 * half.
     """
     return -_soft_max(-_soft_max(values, -half, 0.2 * half), -half, 0.2 * half)
-
-
-def _read_recording(csv_path: Path) -> Floats:
-    """Read the columns t_s, x_mm, y_mm, z_mm of a CSV file as an array (n, 4).
-
-    Raises FingerPathError if the file is invalid.
-    """
-    wanted = ["t_s", "x_mm", "y_mm", "z_mm"]
-    try:
-        lines: Sequence[str] = csv_path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FingerPathError(
-            f"{csv_path}: the file cannot be read: {error}; give a CSV file in UTF-8"
-        ) from error
-    columns = [name.strip() for name in lines[0].split(",")] if lines else []
-    if missing := [name for name in wanted if name not in columns]:
-        raise FingerPathError(
-            f"{csv_path}: the first line does not name the column {missing[0]}; the "
-            f"required columns are "
-            f"{', '.join(wanted)}"
-        )
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines[1:], start=2):
-        cells = line.split(",")
-        try:
-            row = [float(cells[columns.index(name)]) for name in wanted]
-        except (ValueError, IndexError) as error:
-            raise FingerPathError(
-                f"{csv_path}: line {number}: the row is not valid: {error}; correct or delete the "
-                "line"
-            ) from error
-        if not np.isfinite(row).all():
-            raise FingerPathError(
-                f"{csv_path}: line {number}: a value is not finite; correct or delete the line"
-            )
-        if rows and row[0] <= rows[-1][0]:
-            raise FingerPathError(
-                f"{csv_path}: line {number}: t_s does not increase; sort the lines by t_s "
-                "or delete this line"
-            )
-        rows.append(row)
-    if len(rows) < 2:
-        raise FingerPathError(
-            f"{csv_path}: {len(rows)} samples found; give a path with at least two samples"
-        )
-    return np.array(rows)

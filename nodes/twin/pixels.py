@@ -10,7 +10,6 @@ and read noise are added, and the result is clipped and rounded to grey levels.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -223,7 +222,6 @@ class TwinCamera:
         self.skew_s = skew_s
         self.nail = Nail() if nail is None else nail
         self.finger_radius_m = finger_radius_m
-        self.marker_radius_m = MARKER_RADIUS_M
         self.marker_offset_m = self.nail.marker_offset_m
         self.sensor = Sensor() if sensor is None else sensor
         self.clutter = CLUTTER["none"] if clutter is None else clutter
@@ -236,23 +234,6 @@ class TwinCamera:
             self._eye("left", camera.left, left_from_world, sheet),
             self._eye("right", camera.right, right_from_world, sheet),
         )
-
-    def with_changes(
-        self,
-        *,
-        sensor: Sensor | None = None,
-        marker_radius_m: float | None = None,
-        marker_offset_m: Floats | None = None,
-    ) -> TwinCamera:
-        """Return a copy of the camera with another marker or sensor, and the same background.
-
-        marker_offset_m: vector (3,) from the fingertip to the marker, in the world frame.
-        """
-        other = copy.copy(self)
-        other.sensor = self.sensor if sensor is None else sensor
-        other.marker_radius_m = self.marker_radius_m if marker_radius_m is None else marker_radius_m
-        other.marker_offset_m = self.marker_offset_m if marker_offset_m is None else marker_offset_m
-        return other
 
     def picture(
         self,
@@ -375,7 +356,7 @@ class TwinCamera:
         if marker:
             at = tips + self.marker_offset_m
             if self.nail.marker_normal is None:
-                windows.append(self._disc(eye, at, self.marker_radius_m, sensor.marker_level))
+                windows.append(self._disc(eye, at, MARKER_RADIUS_M, sensor.marker_level))
             else:
                 windows.append(self._flat_disc(eye, at, self.nail.marker_normal))
         for thing in _spots(clutter, eye.side):
@@ -502,11 +483,11 @@ class TwinCamera:
         if in_camera[:, 2].min() <= MIN_DEPTH_M or towards <= 0.0:
             return None
         per_slope = pixels_per_slope(eye.lens, x / z, y / z)
-        area_px = math.pi * (self.marker_radius_m * per_slope) ** 2 * towards / z**3 / SPOTS
+        area_px = math.pi * (MARKER_RADIUS_M * per_slope) ** 2 * towards / z**3 / SPOTS
         spread_px = math.hypot(
             self.sensor.spread_px(z, eye.lens.fx_px), math.sqrt(area_px / (4.0 * math.pi))
         )
-        spots = _disc_points(normal) * self.marker_radius_m
+        spots = _disc_points(normal) * MARKER_RADIUS_M
         local = apply(eye.camera_from_world, (places[:, None] + spots).reshape(-1, 3))
         pixels = pixels_of(eye.lens, local[:, :2] / local[:, 2:])
         corners = [pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()]
