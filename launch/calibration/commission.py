@@ -1,8 +1,8 @@
 """Run all calibrations of a laboratory in sequence, and store their results in one folder.
 
 This is called commissioning (`flexsheet commission`). The folder contains the state
-(`commission.json`), the calibration files, and a report. It also contains a scene and a launch file
-that use the calibration files. Each step uses the results of all earlier steps. If a step is
+(`commission.json`), the calibration files, and a scene and a launch file that use the calibration
+files. Each step uses the results of all earlier steps. If a step is
 repeated, all later steps must therefore be run again.
 """
 
@@ -29,7 +29,7 @@ from flexsheet.nodes import node_class
 from flexsheet.nodes.twin.tolerance_table import set_value
 
 STATE_FILE, SCENE_FILE, LAUNCH_FILE = "commission.json", "scene.yaml", "launch.yaml"
-REPORT_FILE, APPARATUS_FILE = "report.md", "apparatus.yaml"
+APPARATUS_FILE = "apparatus.yaml"
 
 
 class CommissionError(FlexsheetError, ValueError):
@@ -63,22 +63,6 @@ class StepName(StrEnum):
 
 
 STEPS = tuple(StepName)
-
-SIMULATED_STEP_S: Mapping[StepName, float] = {
-    StepName.CAMERA: 6.0,
-    StepName.ARMS: 3.6,
-    StepName.EDGES: 1.1,
-    StepName.SHEET: 3.2,
-    StepName.PROJECTOR: 7.1,
-    StepName.MARKER: 2.6,
-    StepName.EYES: 0.5,
-    StepName.DELAYS: 7.5,
-}
-"""The median durations (s) of the steps in 30 simulated laboratories on two processor cores.
-
-Source: docs/results/robustness-commissioned-modern.json. That file has no duration for the
-verification in a running graph.
-"""
 
 
 class NodeValue(LimitedModel):
@@ -257,17 +241,6 @@ class Commissioning:
         """Return the names of the steps that are neither finished nor skipped."""
         return [name for name in STEPS if name not in self.state.steps]
 
-    def expected_s(self, name: StepName) -> float | None:
-        """Return the expected duration (s) of a step, or None if it is unknown.
-
-        A repeated step is expected to take as long as its last run. For the first run of a step in
-        a simulated laboratory, the duration is taken from `SIMULATED_STEP_S`.
-        """
-        record = self.state.steps.get(name)
-        if record is not None and record.result is not None:
-            return record.seconds
-        return None if self.apparatus is None else SIMULATED_STEP_S.get(name)
-
     def skip(self, name: StepName, reason: str) -> None:
         """Mark a step as skipped, and discard the results of all later steps."""
         self._invalidate_from(name)
@@ -301,10 +274,9 @@ class Commissioning:
         self.write()
 
     def write(self) -> None:
-        """Write the state, the scene, the launch file and the report to the folder."""
+        """Write the state, the scene and the launch file to the folder."""
         self._write_scene()
         self._write_launch_file()
-        write_file(self.folder / REPORT_FILE, format_report(self.state))
         write_file(self.folder / STATE_FILE, self.state.model_dump_json(indent=1))
 
     def _write_scene(self) -> None:
@@ -360,55 +332,6 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-MEASURED_IN_OPERATION = (
-    "The actuation delay of each arm, the camera's rate and the age of its images are measured "
-    "while the graph runs. The positions of a head tracker replace the measured eyes."
-)
-
-
-def format_report(state: State) -> str:
-    """Return the report on the calibration of a laboratory as Markdown.
-
-    The report contains residuals, uncertainties, predicted errors and the causes of the largest
-    errors.
-    """
-    lines = [
-        "# Commissioning",
-        "",
-        f"Launch file: {state.launch_file}. Scene: {state.scene_file}. "
-        f"Apparatus: {state.apparatus or 'real devices'}.",
-        "",
-        "| step | date | time | residual | limit | uncertainty (standard deviation) |",
-        "|---|---|---|---|---|---|",
-    ]
-    advice = []
-    for name in STEPS:
-        record = state.steps.get(name)
-        if record is None:
-            lines.append(f"| {name} | not done | | | | |")
-        elif record.result is None:
-            lines.append(f"| {name} | {record.date} | skipped: {record.skipped_because} | | | |")
-        else:
-            result = record.result
-            errors = ", ".join(f"{key} {value:.3g}" for key, value in result.uncertainty.items())
-            lines.append(
-                f"| {name} | {record.date} | {record.seconds:.0f} s | {result.residual:.3g} "
-                f"{result.unit} | {result.limit:g} {result.unit} | {errors} |"
-            )
-            if not result.within_limit:
-                advice.append(f"- {name}: above the limit. {result.advice}")
-            advice += [f"- {name}: {one.describe()}" for one in result.missing]
-    if StepName.VERIFICATION in state.steps:
-        lines += ["", "## Verification", ""]
-        lines += [line for text in format_verdict(state) for line in (text, "")]
-        if figures := _verification_figures(state):
-            lines += _format_figures(figures)
-    lines += ["", "## What limits the accuracy", ""]
-    lines += [f"- {text}" for text in list_limits(state)]
-    lines += [*advice, f"- {MEASURED_IN_OPERATION}", ""]
-    return "\n".join(lines)
-
-
 def _verification_figures(state: State) -> Mapping[str, Any]:
     record = state.steps.get(StepName.VERIFICATION)
     return {} if record is None or record.result is None else record.result.figures
@@ -430,8 +353,6 @@ def format_verdict(state: State) -> list[str]:
     if not doubts:
         return ["The laboratory is good: all errors are expected within tolerance."]
     lines = ["The laboratory is not good:", *(f"- {one}" for one in doubts)]
-    if repeat := figures.get("repeat"):
-        lines.append(f"Repeat these steps: {', '.join(repeat)}.")
     return lines
 
 
@@ -445,81 +366,10 @@ def is_good(state: State) -> bool:
     return bool(figures) and not figures.get("doubts")
 
 
-def _format_figures(figures: Mapping[str, Any]) -> list[str]:
-    measured = _find_measured_errors(figures)
-    lines = [
-        "| metric | measured | predicted root mean square | predicted 95 % | tolerance |",
-        "|---|---|---|---|---|",
-    ]
-    for metric, one in figures.get("predicted", {}).items():
-        name, unit = _split_metric(metric)
-        value = f"{measured[metric]:.3g} {unit}" if metric in measured else "not measured"
-        predicted = " | ".join(
-            f"{one[key]:.3g} {unit}" for key in ("typical", "limit_95", "tolerance")
-        )
-        lines.append(f"| {name} | {value} | {predicted} |")
-    lines += ["", "Sheet and fingertip are measured during the stroke, image and force at rest."]
-    lines += ["", "| figure | value |", "|---|---|"]
-    stroke = figures.get("stroke", {})
-    for name, key, unit in (
-        ("position error Δd of the sheet", "delta_d_mm", "mm"),
-        ("angular error Δθ of the sheet", "delta_theta_deg", "°"),
-    ):
-        found = stroke.get(f"true_{key}", stroke.get(key, {}))
-        if "max" in found:
-            lines.append(
-                f"| {name}, mean / maximum | {found['mean']:.3g} / {found['max']:.3g} {unit} |"
-            )
-    for key, found in stroke.get("latency_ms", {}).items():
-        if found["p50"] is not None:
-            name = key.replace("_", " ")
-            lines.append(
-                f"| latency {name}, p50 / p99 | {found['p50']:.3g} / {found['p99']:.3g} ms |"
-            )
-    if "drops" in stroke:
-        lines.append(f"| lost or refused messages (drops) | {stroke['drops']} |")
-    if crosses := figures.get("co_location"):
-        lines += [
-            "| co-location of image and touch, mean / maximum | "
-            f"{crosses['mean_mm']:.3g} / {crosses['max_mm']:.3g} mm |",
-        ]
-    return [*lines, "", f"All figures: {STATE_FILE}, steps.verification.result.figures."]
-
-
-def _split_metric(metric: str) -> tuple[str, str]:
-    """Return the name and the unit of a metric such as "sheet_mm"."""
-    name, _, unit = metric.rpartition("_")
-    return name, "%" if unit == "percent" else unit
-
-
-MOVING = {"sheet_mm": ("delta_d_mm", "true_delta_d_mm"), "fingertip_mm": ("fingertip_mm",)}
-"""The metrics that are measured while the finger moves, with the keys of their measured values.
-
-If the result of the finger's stroke contains several of the keys, the last one is used.
-"""
-
-
-def _find_measured_errors(figures: Mapping[str, Any]) -> dict[str, float]:
-    """Return the measured errors by metric.
-
-    The errors of the sheet and the fingertip are means over a stroke of the finger. The other
-    errors are measured at rest. For real devices, the true errors are unknown, and the result
-    contains only the sheet error that the devices report.
-    """
-    stroke = figures.get("stroke", {})
-    found = dict(figures.get("at_rest", {}).get("after", {}))
-    for metric, keys in MOVING.items():
-        for key in keys:
-            if key in stroke:
-                found[metric] = stroke[key]["mean"]
-    return {metric: value for metric, value in found.items() if value is not None}
-
-
 def list_doubts(
     steps: Mapping[StepName, StepRecord],
     figures: Mapping[str, Any],
     tracking: tuple[float, float],
-    check_command: str,
 ) -> list[str]:
     """Return the reasons why the display errors in a laboratory may exceed a tolerance.
 
@@ -528,13 +378,12 @@ def list_doubts(
     figures: results of the step "verification".
     tracking: mean measured error (mm) of the sheet while it follows a stroke of the finger, and the
         tolerance (mm) of this error.
-    check_command: command line that repeats the verification.
     """
     doubts = []
     if figures.get("overloaded"):
         doubts.append(
-            f"the computer was overloaded during the verification{_describe_effects(figures)}; run "
-            f"on an idle computer: {check_command}"
+            "the computer was overloaded during the verification; repeat it on an idle computer "
+            "(--step verification)"
         )
     for name, record in steps.items():
         if name is StepName.VERIFICATION:
@@ -561,73 +410,3 @@ def list_doubts(
             f"{tracking[1]:.3g} mm"
         )
     return doubts
-
-
-def _describe_effects(figures: Mapping[str, Any]) -> str:
-    """Return a text in parentheses with the latency and the lost messages of the stroke, or ""."""
-    stroke = figures.get("stroke", {})
-    effects = []
-    latency_ms = stroke.get("latency_ms", {}).get("exposure_to_frame", {}).get("p50")
-    if latency_ms is not None:
-        effects.append(f"median latency from exposure to frame {latency_ms:.0f} ms")
-    if drops := stroke.get("drops"):
-        effects.append(f"{drops} lost or refused messages")
-    return f" ({', '.join(effects)})" if effects else ""
-
-
-def list_limits(state: State) -> list[str]:
-    """Return texts that state what limits the accuracy, with the most important limit first.
-
-    If the laboratory is verified, the first text names the metric that is nearest to its tolerance.
-    The other texts name the uncertainties of the steps.
-    """
-    nearest = _describe_nearest_metric(_verification_figures(state))
-    return ([] if nearest is None else [nearest]) + _rank_uncertainties(state)
-
-
-SMALL_ERROR_RATIO = 0.5
-"""An error at rest is small if it is at most this fraction of the error in motion.
-
-The squares of independent errors add up. A small error at rest therefore causes at most a quarter
-of the mean square error in motion.
-"""
-
-
-def _describe_nearest_metric(figures: Mapping[str, Any]) -> str | None:
-    """Describe the metric that is nearest to its tolerance; None if no metric was measured."""
-    measured = _find_measured_errors(figures)
-    ratios = {
-        metric: measured[metric] / one["tolerance"]
-        for metric, one in figures.get("predicted", {}).items()
-        if metric in measured
-    }
-    if not ratios:
-        return None
-    metric = max(ratios, key=lambda name: ratios[name])
-    name, unit = _split_metric(metric)
-    value, tolerance = measured[metric], figures["predicted"][metric]["tolerance"]
-    text = (
-        f"{name}: measured {value:.3g} {unit}, tolerance {tolerance:.3g} {unit}; this metric is "
-        "nearest to its tolerance."
-    )
-    at_rest = figures.get("at_rest", {}).get("after", {}).get(metric)
-    if at_rest is None:
-        return text
-    if metric not in MOVING:
-        return f"{text} It is measured at rest, so motion and delays do not cause it."
-    text += f" The error at rest is {at_rest:.3g} {unit}"
-    if at_rest <= SMALL_ERROR_RATIO * value:
-        return f"{text}, which is small: motion and delays cause most of the error."
-    return f"{text}, which is a large part of the error."
-
-
-def _rank_uncertainties(state: State) -> list[str]:
-    """Return a text for each uncertainty (mm) in the steps' results, with the largest first."""
-    found = [
-        (value, f"{name}: {key.removesuffix('_mm').replace('_', ' ')} {value:.2f} mm")
-        for name, record in state.steps.items()
-        if record.result is not None
-        for key, value in record.result.uncertainty.items()
-        if key.endswith("_mm")
-    ]
-    return [text for _, text in sorted(found, reverse=True)]

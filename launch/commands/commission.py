@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,10 +107,6 @@ def commission(
             help="Step to skip, and the reason; repeat the option for several steps.",
         ),
     ] = None,
-    check: Annotated[
-        bool,
-        typer.Option("--check", help="Repeat only the verification step, with the stored results."),
-    ] = False,
     duration: Annotated[
         float,
         typer.Option(
@@ -144,10 +139,6 @@ def commission(
             "--data, --finger-radius-mm and --sheet-kg-per-m2 are for real devices; remove them or "
             "--apparatus"
         )
-    if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
-        raise CommandError(
-            "--check repeats only the verification; remove --step, --skip and --data of other steps"
-        )
     lab, devices = open_laboratory(
         output,
         launch_file,
@@ -161,23 +152,13 @@ def commission(
         seconds=duration,
         seed=seed,
     )
-    if check:
-        unfinished = [name for name in lab.pending() if name is not StepName.VERIFICATION]
-        if unfinished:
-            raise CommandError(
-                f"--check: the steps {', '.join(unfinished)} are not done; run them first, or skip "
-                "them with a reason"
-            )
-        repeats = [StepName.VERIFICATION]
     missing: MissingDataError | None = None
     try:
         for name in StepName:
             if name in skips:
                 lab.skip(name, skips[name])
             elif name in repeats or name not in lab.state.steps:
-                expected_s = lab.expected_s(name)
-                expected = "" if expected_s is None else f", about {math.ceil(expected_s)} s"
-                words.print(f"step {name}{expected}")
+                words.print(f"step {name}")
                 lab.run(name, devices.steps[name])
     except MissingDataError as error:
         missing = error
@@ -212,7 +193,7 @@ def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
 
 def summarize(lab: Commissioning) -> dict[str, Any]:
     """Return the state of a laboratory's calibration for `flexsheet commission --json`."""
-    from flexsheet.launch.calibration.commission import APPARATUS_FILE, REPORT_FILE, StepName
+    from flexsheet.launch.calibration.commission import APPARATUS_FILE, StepName
 
     steps = []
     for record in (lab.state.steps[name] for name in StepName if name in lab.state.steps):
@@ -232,7 +213,6 @@ def summarize(lab: Commissioning) -> dict[str, Any]:
         "launch_file": str(lab.launch_copy),
         "scene_file": str(lab.scene_copy),
         "apparatus": str(apparatus) if apparatus.exists() else None,
-        "report": str(lab.folder / REPORT_FILE),
         "steps": steps,
         "verification": found or {},
         "complete": not lab.pending(),
@@ -240,7 +220,7 @@ def summarize(lab: Commissioning) -> dict[str, Any]:
 
 
 def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
-    from flexsheet.launch.calibration.commission import format_verdict, list_limits
+    from flexsheet.launch.calibration.commission import format_verdict
 
     result = summarize(lab)
     if as_json:
@@ -262,9 +242,8 @@ def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
             for one in result["steps"]
         ],
     )
-    words.print(f"launch file: {result['launch_file']}\nreport: {result['report']}")
+    words.print(f"launch file: {result['launch_file']}")
     if missing is not None:
         words.print(str(missing))
-    if verdict := format_verdict(lab.state):
-        limits = [f"What limits the accuracy: {one}" for one in list_limits(lab.state)[:1]]
-        words.print("\n".join([*verdict, *limits]))
+    for line in format_verdict(lab.state):
+        words.print(line)

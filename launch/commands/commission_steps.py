@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,7 +41,6 @@ from flexsheet.launch.commands import (
 )
 from flexsheet.launch.plans.apparatus import format_apparatus
 from flexsheet.launch.plans.plan import load_graph, load_scene
-from flexsheet.launch.plans.shipped import LAUNCH_FILES
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import (
     Board,
@@ -93,14 +91,6 @@ INSTRUCTIONS: dict[StepName, str] = {
     StepName.VERIFICATION: "run `flexsheet experiment stroke --launch FOLDER/launch.yaml --json` "
     "with the launch file of this folder, and give its output with --data verification=JSON",
 }
-
-REPEAT: dict[str, StepName] = {
-    "camera_moved": StepName.ARMS,
-    "cameras_misaligned": StepName.CAMERA,
-    "marker_offset": StepName.MARKER,
-    "sheet_stiffness": StepName.SHEET,
-}
-"""The commissioning step to repeat for each calibration error that a node's self-check reports."""
 
 
 def open_laboratory(
@@ -575,10 +565,7 @@ class Laboratory:
         # A stroke in simulated time has no load, because no graph runs.
         busy_fraction = figures["stroke"].get("busy_fraction")
         figures["overloaded"] = busy_fraction is not None and busy_fraction > BRIEFLY_BUSY_FRACTION
-        figures["doubts"] = list_doubts(
-            lab.state.steps, figures, (tracking_mm, limit_mm), _format_check_command(lab)
-        )
-        figures["repeat"] = [REPEAT[one] for one in figures["flagged"] if one in REPEAT]
+        figures["doubts"] = list_doubts(lab.state.steps, figures, (tracking_mm, limit_mm))
         return StepResult(
             residual=tracking_mm,
             unit="mm",
@@ -586,19 +573,6 @@ class Laboratory:
             advice="Repeat the steps that the verification names.",
             figures=figures,
         )
-
-
-def _format_check_command(lab: Commissioning) -> str:
-    """Return the command line that repeats the verification of a laboratory."""
-    line = ["flexsheet", "commission", "--check", "--output", str(lab.folder)]
-    if lab.launch_file.resolve() != (LAUNCH_FILES / "demo.yaml").resolve():
-        line += ["--launch", str(lab.launch_file)]
-    named = load_graph(lab.launch_file).scene_file
-    if named is None or lab.scene_file.resolve() != Path(named).resolve():
-        line += ["--scene", str(lab.scene_file)]
-    if lab.apparatus is not None:
-        line += ["--apparatus", lab.apparatus]
-    return shlex.join(line)
 
 
 def collect_knowledge(lab: Commissioning) -> Knowledge:
