@@ -9,7 +9,7 @@ from __future__ import annotations
 # Importing `typing` would lengthen the time in which an interrupt meets Python's own handler.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from flexsheet.launch.bags.parquet import read_table
+    from flexsheet.launch.bags.arrays import read_arrays
     from flexsheet.launch.commands.graph import running_graph
     from flexsheet.launch.experiments import ExperimentError
     from flexsheet.launch.experiments.driver import Driver
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 _EXPORTS = {
-    "flexsheet.launch.bags.parquet": ("read_table",),
+    "flexsheet.launch.bags.arrays": ("read_arrays",),
     "flexsheet.launch.commands.graph": ("running_graph",),
     "flexsheet.launch.experiments": ("ExperimentError",),
     "flexsheet.launch.experiments.driver": ("Driver",),
@@ -71,7 +71,7 @@ __all__ = [
     "load_graph",
     "load_scene",
     "periodic",
-    "read_table",
+    "read_arrays",
     "read_topic",
     "recover",
     "run_experiment",

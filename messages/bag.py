@@ -63,8 +63,8 @@ class BagError(FlexsheetError):
     """Raised if a bag cannot be written or read. The text names the file and the cause."""
 
     remedy = (
-        "`flexsheet bag info BAG` reports how much is readable. `flexsheet bag recover` writes the "
-        "readable part to a complete bag."
+        "`flexsheet bag info BAG` reports how much is readable. `flexsheet bag export BAG -o NEW "
+        "--format bag` writes the readable part to a complete bag."
     )
 
 
@@ -641,8 +641,8 @@ class BagReader:
         except Exception as error:
             raise BagError(
                 f"{self.path}: damaged chunk at byte {chunk.offset}: "
-                f"{str(error) or type(error).__name__}; `flexsheet bag recover` saves the other "
-                "chunks"
+                f"{str(error) or type(error).__name__}; `flexsheet bag export --format bag` "
+                "saves the other chunks"
             ) from error
 
     def _check_topics(self) -> None:

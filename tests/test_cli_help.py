@@ -55,7 +55,7 @@ def parse(line: str) -> str:
 def test_the_command_line_is_this() -> None:
     assert set(COMMANDS) >= {
         "launch", "node list", "node info", "topic list", "topic info", "topic echo",
-        "topic hz", "topic pub", "bag record", "bag play", "bag info", "bag recover", "bag export",
+        "topic hz", "topic pub", "bag record", "bag play", "bag info", "bag export",
         "bag verify", "experiment stroke", "experiment tilt", "experiment push", "chart",
         "calibrate stereo", "calibrate check", "calibrate projector", "calibrate arms",
         "calibrate sheet", "keys new", "doctor",

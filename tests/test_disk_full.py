@@ -40,8 +40,8 @@ COMMANDS = {
     "keys new": "keys new left",
     "keys install": "keys install {disk}/graph.yaml main {key}",
     "calibrate board": "calibrate board --board 9x6 --square-mm 25 -o {disk}/board.svg",
-    "bag recover": "bag recover {bag} -o {disk}/out.mcap",
     "bag export": "bag export {bag} -o {disk}/out.mcap",
+    "bag export --format bag": "bag export {bag} -o {disk}/out.mcap --format bag",
     "bag report": "bag report {bag} -o {disk}/out.html",
     "launch": "launch {disk}/graph.yaml",
 }

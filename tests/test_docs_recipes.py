@@ -130,7 +130,7 @@ def sheet_target(valid_at_ns: int, push_depth_m: float) -> SheetTarget:
 
 def test_the_plot_script_reads_a_bag(tmp_path: Path) -> None:
     write_stroke(tmp_path / "stroke.mcap", count=20)
-    run_script(python_block("other-tools.md", "BagReader"), tmp_path, "stroke.mcap")
+    run_script(python_block("other-tools.md", "read_arrays"), tmp_path, "stroke.mcap")
     assert (tmp_path / "stroke.png").stat().st_size > 0
     rows = np.loadtxt(tmp_path / "stroke.csv", delimiter=",", skiprows=1)
     assert rows.shape == (20, 4)

@@ -19,9 +19,9 @@ from flexsheet.messages.wire import PROTOCOL
 from tests.sessions import write_session
 from tests.test_cli import Command
 
-COMMANDS = ("info {bag}", "verify planner {bag}", "report {bag} -o {out}.html",
+COMMANDS = ("info {bag}", "verify {bag} planner", "report {bag} -o {out}.html",
             "export {bag} -o {out}.mcap", "export {bag} -o {out} --format ros2",
-            "to-parquet {bag} -o {out}", "recover {bag} -o {out}-2.mcap",
+            "export {bag} -o {out}-2.mcap --format bag",
             "play {bag} --launch {graph}")  # fmt: skip
 GRAPH = "external_topics: [estop]\nnodes: {}\n"
 MAX_GROWTH_KB = 400_000

@@ -533,7 +533,7 @@ async def test_an_unfinished_bag_is_reported_before_its_recorder_is_killed(
         os.kill(os.getpid(), signal.SIGINT)
         await until(lambda: words in log.read_text(), words)
 
-    unfinished = f"flexsheet bag recover {bag} -o NEW"
+    unfinished = f"flexsheet bag export {bag} -o NEW --format bag"
     if grace_s < DEADLINE_S:
         await interrupt(log, unfinished)
     else:

@@ -1,4 +1,4 @@
-"""`flexsheet bag`: record, play, recover, export and verify bags, and write reports on them."""
+"""`flexsheet bag`: record, play, export and verify bags, and write reports on them."""
 
 from __future__ import annotations
 
@@ -35,13 +35,11 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from flexsheet.launch.bags.export import ExportResult
     from flexsheet.launch.bags.replay import Verification
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
 
 PROGRESS_PERIOD_S = 0.2
-MAX_TOPICS_LISTED = 10
 
 app = options.make_app("Record, play and analyse bags, which are MCAP files of recorded topics.")
 
@@ -236,26 +234,12 @@ def info(bag: options.BagArgument, as_json: options.JsonOption = False) -> None:
     )
 
 
-@app.command(epilog=examples("flexsheet bag recover cut.mcap -o whole.mcap"))
-def recover(
-    bag: options.BagArgument,
-    output: Annotated[Path | None, options.output_file("Recovered bag to write.", "BAG")] = None,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Copy the readable messages of a truncated or damaged bag to a new bag."""
-    from flexsheet.messages.bag import recover as recover_bag
-
-    output = _require_output(output)
-    with progress_bar(f"recovering {bag.name}") as progress:
-        report = recover_bag(bag, output, progress=progress)
-    print_result({**asdict(report), "output": str(output)}, as_json=as_json)
-
-
 @app.command(
     epilog=examples(
         "flexsheet bag export session.mcap -o for-foxglove.mcap",
         "flexsheet bag export session.mcap -o small.mcap --topic fingertip --topic sheet_target",
         "flexsheet bag export session.mcap -o for-ros --format ros2",
+        "flexsheet bag export cut.mcap -o whole.mcap --format bag",
     )
 )
 def export(
@@ -266,48 +250,41 @@ def export(
         options.output_file("MCAP file, or folder of a ROS 2 bag (--format ros2), to write."),
     ] = None,
     form: Annotated[
-        Literal["foxglove", "ros2"],
-        typer.Option("--format", help="foxglove: MCAP for Foxglove and Rerun; ros2: ROS 2."),
+        Literal["foxglove", "ros2", "bag"],
+        typer.Option(
+            "--format",
+            help="foxglove: MCAP for Foxglove and Rerun; ros2: ROS 2; bag: complete bag with the "
+            "readable messages of a truncated or damaged bag.",
+        ),
     ] = "foxglove",
     topics: options.TopicsOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Convert a bag to an MCAP file for the viewers Foxglove and Rerun, or for ROS 2."""
-    output = _require_output(output)
+    """Convert a bag for the viewers Foxglove and Rerun or for ROS 2, or repair a damaged bag."""
+    if output is None:
+        raise CommandError("the output file is missing; add --output FILE")
+    if form == "bag":
+        from flexsheet.messages.bag import recover
+
+        if topics:
+            raise CommandError("--format bag copies all topics; omit --topic")
+        with progress_bar(f"repairing {bag.name}") as progress:
+            report = recover(bag, output, progress=progress)
+        print_result({**asdict(report), "output": str(output)}, as_json=as_json)
+        return
     if form == "ros2":
         from flexsheet.launch.bags.export_ros2 import export_ros2 as export_bag
     else:
         from flexsheet.launch.bags.export import export as export_bag
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
-    _print_export(result, "channel", as_json=as_json)
-
-
-@app.command(
-    "to-parquet",
-    epilog=examples(
-        "flexsheet bag to-parquet session.mcap -o tables",
-        "flexsheet bag to-parquet session.mcap -o tables --topic fingertip --topic sheet_target",
-    ),
-)
-def to_parquet(
-    *,
-    bag: options.BagArgument,
-    output: Annotated[
-        Path | None,
-        options.output_file("Folder to write; default: path of the bag without suffix.", "FOLDER"),
-    ] = None,
-    topics: options.TopicsOption = None,
-    images: Annotated[bool, typer.Option("--images", help="Also export images, as bytes.")] = False,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Convert each topic of a bag to a Parquet file, for pandas and other analysis tools."""
-    from flexsheet.launch.bags.parquet import write_parquet
-
-    output = output or bag.with_suffix("")
-    with progress_bar(f"converting {bag.name}") as progress:
-        result = write_parquet(bag, output, topics=topics, images=images, progress=progress)
-    _print_export(result, "topic", as_json=as_json)
+    if result.unreadable:
+        listed = ", ".join(result.unreadable)
+        words.print(f"not exported: {listed} (recorded with incompatible message types)")
+    if as_json:
+        print_json({**asdict(result), "output": str(result.output)})
+        return
+    print_table(("channel", "messages"), sorted(result.messages.items()))
 
 
 @app.command(
@@ -340,8 +317,6 @@ def verify(
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
-    if node.endswith(".mcap") and bag.suffix != ".mcap":  # former argument order
-        bag, node = Path(node), str(bag)
     logs_on_stderr()
     with progress_bar(f"replaying {node} twice with {bag.name}") as progress:
         result = verify_node(bag, node, tolerance=tolerance, progress=progress)
@@ -390,66 +365,6 @@ def report(
     for finding in result["findings"]:
         words.print(f"{finding['gravity']}: {finding['text']}")
     print(page)
-
-
-@app.command(
-    epilog=examples(
-        "flexsheet bag plot session.mcap fingertip.position_world_m",
-        "flexsheet bag plot session.mcap arm_left.joints_rad sheet_target.stretch_ratio -o a.svg",
-    )
-)
-def plot(
-    bag: options.BagArgument,
-    fields: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="TOPIC.FIELD...",
-            help="Numeric fields, such as fingertip.position_world_m. Each field has its own "
-            "chart. For a topic without a field, the possible fields are listed.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        options.output_file(
-            "Image file to write (.svg, .png); default: bag path with the suffix .svg."
-        ),
-    ] = None,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Plot fields of recorded topics against time.
-
-    With --json, the command prints the values instead, and writes an image only if --output is
-    given.
-    """
-    from flexsheet.launch.bags.plot import draw_fields, read_fields
-
-    with progress_bar(f"reading {bag.name}") as progress:
-        series = read_fields(bag, fields, progress)
-    image = output if as_json else output or bag.with_suffix(".svg")
-    if image is not None:
-        draw_fields(series, image, title=bag.name)
-    if as_json:
-        print_json([one.to_json() for one in series])
-    else:
-        print(image)
-
-
-def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
-    if result.unreadable:
-        listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
-        more = len(result.unreadable) - MAX_TOPICS_LISTED
-        also = f" and {more} more" if more > 0 else ""
-        words.print(f"not exported: {listed}{also} (recorded with incompatible message types)")
-    if as_json:
-        print_json({**asdict(result), "output": str(result.output)})
-        return
-    print_table((unit, "messages"), sorted(result.messages.items()))
-
-
-def _require_output(output: Path | None) -> Path:
-    if output is None:
-        raise CommandError("the output file is missing; add --output FILE")
-    return output
 
 
 def _print_verification(result: Verification) -> None:

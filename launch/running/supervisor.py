@@ -225,7 +225,7 @@ class RunningGraph:
             self._report(
                 LAUNCHER,
                 f"the bag {bag} may be incomplete, because its recorder is killed; write its "
-                f"readable messages to a new bag: flexsheet bag recover {bag} -o NEW",
+                f"readable messages to a new bag: flexsheet bag export {bag} -o NEW --format bag",
             )
         for child in children:
             child.signal(number)
