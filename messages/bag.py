@@ -32,7 +32,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -48,7 +47,6 @@ from flexsheet.messages.wire import PROTOCOL, WireError, decode, encode
 PROFILE = "flexsheet"
 CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
-MAX_SUMMARY_RECORD_BYTES = 64 << 20
 MAX_CHUNK_BYTES = 256 << 20
 """The maximum uncompressed size of a chunk, in bytes, that a reader accepts.
 
@@ -407,14 +405,8 @@ class BagReader:
         """
         for channel in self._selected().values():
             self._check_readable(channel)
-        for number, (name, frames, log_time_ns) in enumerate(self.frames()):
-            try:
-                message, header = decode(frames, TOPICS[name])
-            except WireError as error:
-                raise BagError(
-                    f'{self.path}: topic "{name}", message {number} at {log_time_ns} ns: {error}'
-                ) from error
-            yield name, message, header, log_time_ns
+        for channel, record in self.records():
+            yield channel.topic, *self.open_record(channel, record), record.log_time
 
     def open_record(
         self, channel: mcap_records.Channel, record: mcap_records.Message
@@ -582,8 +574,6 @@ class BagReader:
             Opcode.MESSAGE_INDEX,
         ):
             return
-        if length > MAX_SUMMARY_RECORD_BYTES:
-            raise ValueError(f"a record states an implausible length of {length} bytes")
         stream = ReadDataStream(BytesIO(_read_at(file, offset, length)))
         if opcode == Opcode.HEADER:
             profile = mcap_records.Header.read(stream).profile
@@ -634,9 +624,10 @@ class BagReader:
         """Return the MCAP records of a chunk. Raises BagError if the chunk is damaged."""
         body = _read_at(file, chunk.offset, chunk.length)
         try:
-            parsed = mcap_records.Chunk.read(ReadDataStream(BytesIO(body)))
-            parsed.data, parsed.compression = _decompress(parsed), ""
-            return breakup_chunk(parsed, validate_crc=True)
+            packed = mcap_records.Chunk.read(ReadDataStream(BytesIO(body)))
+            if packed.uncompressed_size > MAX_CHUNK_BYTES:
+                raise ValueError(f"it decompresses to {packed.uncompressed_size} bytes")
+            return breakup_chunk(packed, validate_crc=True)
         # Decompression and parsing raise unspecified errors on damaged bytes.
         except Exception as error:
             raise BagError(
@@ -794,32 +785,6 @@ def recover(
 def _read_at(file: IO[bytes], offset: int, length: int) -> bytes:
     file.seek(offset)
     return file.read(length)
-
-
-def _decompress(chunk: mcap_records.Chunk) -> bytes:
-    """Decompress a chunk up to the size that its header states.
-
-    The limit prevents a few compressed bytes from filling the memory. Raises ValueError if the
-    stated size is too large or wrong.
-    """
-    stated = chunk.uncompressed_size
-    if stated > MAX_CHUNK_BYTES:
-        raise ValueError(
-            f"its header states {stated} uncompressed bytes; the limit is {MAX_CHUNK_BYTES}"
-        )
-    match chunk.compression:
-        case "":
-            data = chunk.data
-        case "zstd":
-            with zstandard.ZstdDecompressor().stream_reader(chunk.data) as packed:
-                data = packed.read(stated + 1)
-        case other:
-            raise ValueError(f"its compression is {other[:40]!r}; expected zstd or none")
-    if len(data) != stated:
-        raise ValueError(
-            f"its uncompressed size differs from the {stated} bytes that its header states"
-        )
-    return data
 
 
 def _parse_attachment(body: bytes) -> mcap_records.Attachment:

@@ -126,20 +126,20 @@ def test_a_chunk_is_unpacked_no_further_than_it_claims(tmp_path: Path, claimed: 
     bag = rewritten(tmp_path / "b.mcap", [(op, chunk if op == 6 else body) for op, body in records])
     tracemalloc.start()
     try:
-        with pytest.raises(BagError, match=r"uncompressed (size|bytes)"):
+        with pytest.raises(BagError, match="decompress"):
             list(BagReader(bag))
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
 
 
-def test_a_chunk_packed_otherwise_is_named(tmp_path: Path) -> None:
+def test_a_chunk_packed_otherwise_is_reported(tmp_path: Path) -> None:
     records = small_bag(tmp_path / "a.mcap", compress=False)
     changed = [
         (op, body[:28] + struct.pack("<I", 3) + b"lz4" + body[32:] if op == 6 else body)
         for op, body in records
     ]
-    with pytest.raises(BagError, match="'lz4'"):
+    with pytest.raises(BagError, match="damaged chunk"):
         list(BagReader(rewritten(tmp_path / "b.mcap", changed)))
 
 
