@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.calibration_file import (
     CalibrationFile,
     CalibrationMismatchError,
 )
 from flexsheet.messages.scene import NonNegative, Part, Positive, SheetSpec
-
-Axis = Annotated[NDArray[np.float64], ArraySpec("<f8", ("entries",))]
-Entries = Annotated[NDArray[np.float64], ArraySpec("<f8", ("stretches", "depths", "xs", "ys"))]
 
 NOMINAL_RATIO = 0.02
 """The maximum relative difference between the sheet sizes in a calibration and in the scene."""
@@ -37,19 +31,6 @@ class LeftOutRow(Part):
 
     line: Annotated[int, Field(ge=1)]
     residual_ratio: float = Field(description="measured force divided by fitted force, minus one")
-
-
-class SheetTable(Part):
-    """A table of the ratio of the measured force on the finger to the force of the fitted model.
-
-    The ratio is interpolated linearly over stretch and position, and by cubics over depth.
-    """
-
-    stretch_ratios: Axis = Field(description="edge distance divided by the nominal width")
-    depths_m: Axis
-    xs_m: Axis
-    ys_m: Axis
-    ratios: Entries
 
 
 class SheetCalibration(CalibrationFile):
@@ -76,11 +57,6 @@ class SheetCalibration(CalibrationFile):
         description="cubic term of the unstretched sheet's force, divided by the cubic term of "
         "ideal rubber"
     )
-    mooney_ratio: Fitted | None = Field(
-        default=None,
-        description="ratio C2/(C1+C2) of the Mooney-Rivlin constants; null: the ratio was not "
-        "fitted",
-    )
     hysteresis_ratio: Fitted | None = Field(
         default=None,
         description="fraction of the loading energy that is lost in a cycle; null: the fraction "
@@ -98,7 +74,6 @@ class SheetCalibration(CalibrationFile):
     min_stretch_ratio: Positive
     max_stretch_ratio: Positive
     max_depth_m: Positive
-    table: SheetTable | None = None
 
 
 def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:

@@ -224,12 +224,10 @@ def test_a_stiffer_sheet_is_identified_from_pushes_between_the_true_arms() -> No
     reduced = SCENE.model_copy(
         update={"working_range": SCENE.working_range.model_copy(update={"push_depth_m": 0.012})}
     )
-    rows = simulate_rows(reduced, places=False, noise_n=0.003, seed=2, apparatus=given)
+    rows = simulate_rows(reduced, noise_n=0.003, seed=2, apparatus=given)
     assert [row.unloading for row in rows[:2]] == [False, True]
     assert rows[0].force_n > rows[1].force_n
-    found = fit_sheet(
-        SCENE, rows, list(range(len(rows))), source="twin", with_mooney=False, with_table=False
-    )
+    found = fit_sheet(SCENE, rows, list(range(len(rows))), source="twin")
     assert found.modulus_thickness_n_per_m.value == pytest.approx(1200.0, rel=0.06)
     assert found.slack_width_m.value == pytest.approx(0.2405, abs=8e-4)
     assert found.hysteresis_ratio is not None

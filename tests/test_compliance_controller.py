@@ -198,7 +198,6 @@ async def test_a_calibrated_sheet_is_planned_with() -> None:
         modulus_thickness_n_per_m=700.0,
         slack_width_m=SCENE.sheet.width_m,
         cubic_ratio=1.0,
-        mooney_ratio=0.0,
     )
     ideal, calibrated = (
         ComplianceController(SCENE, law, "force_curve")

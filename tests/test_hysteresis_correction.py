@@ -90,7 +90,7 @@ def pushes(ratio: float, noise: float = 0.002) -> list[MeasuredPush]:
 
 def calibrate(rows: list[MeasuredPush]) -> SheetCalibration:
     lines = list(range(len(rows)))
-    return make_calibration(SCENE, rows, lines, source="test", with_mooney=False, with_table=False)
+    return make_calibration(SCENE, rows, lines, source="test")
 
 
 def test_the_calibration_estimates_the_hysteresis() -> None:

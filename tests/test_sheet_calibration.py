@@ -19,7 +19,6 @@ from flexsheet.launch.calibration.sheet_fit import (
     MeasuredPush,
     SheetModelFitError,
     fit_sheet_model,
-    tabulate_pushes,
 )
 from flexsheet.launch.calibration.sheet_rows import read_rows, simulate_rows
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
@@ -38,7 +37,6 @@ from flexsheet.nodes.models.sheet.force_models import (
     SheetPush,
     make_model,
 )
-from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -82,7 +80,6 @@ def test_sheet_parameters_are_recovered(modulus: float, width: float, cubic: flo
         modulus_thickness_n_per_m=modulus,
         slack_width_m=width,
         cubic_ratio=cubic,
-        mooney_ratio=0.0,
     )
     fit = fit_sheet_model(pushes_of(law), NOMINAL)
     assert fit.values == pytest.approx((modulus, width, cubic), rel=1e-3)
@@ -96,7 +93,6 @@ def test_errors_are_within_stated_deviations_without_outliers() -> None:
         modulus_thickness_n_per_m=1500.0,
         slack_width_m=0.2385,
         cubic_ratio=1.3,
-        mooney_ratio=0.0,
     )
     rows = pushes_of(law, noise_n=0.01)
     for number, factor in ((3, 3.0), (12, 0.2)):
@@ -122,7 +118,6 @@ def make_sheet_model(modulus: float = 1000.0, width: float = 0.24) -> ScaledShee
         modulus_thickness_n_per_m=modulus,
         slack_width_m=width,
         cubic_ratio=1.0,
-        mooney_ratio=0.0,
     )
 
 
@@ -165,21 +160,6 @@ def test_a_wrong_sheet_or_gauge_is_doubted(fault: Any) -> None:
     assert fit_sheet_model(fault(good), NOMINAL).rms_sigmas > 1.1 * MAX_RMS_SIGMAS
 
 
-def test_mooneys_fraction_is_found_at_large_stretch() -> None:
-    law = make_model(
-        NOMINAL,
-        modulus_thickness_n_per_m=900.0,
-        slack_width_m=0.24,
-        cubic_ratio=1.0,
-        mooney_ratio=0.4,
-    )
-    rows = pushes_of(law, stretches=(1.02, 1.05, 1.12, 1.2, 1.3), edges=True)
-    fit = fit_sheet_model(rows, NOMINAL, with_mooney=True)
-    assert fit.names[3] == "mooney_ratio"
-    assert fit.values == pytest.approx((900.0, 0.24, 1.0, 0.4), rel=0.02)
-    assert 0.0 < fit.standard_deviations[3] < 0.2
-
-
 def test_edge_forces_reduce_the_uncertainty() -> None:
     law = ScaledSheetModel(NOMINAL)
     without = fit_sheet_model(pushes_of(law), NOMINAL)
@@ -205,37 +185,6 @@ def test_rows_that_do_not_determine_the_fit_are_rejected(
 ) -> None:
     with pytest.raises(SheetModelFitError, match=words):
         fit_sheet_model(rows, NOMINAL)
-
-
-def test_table_keeps_the_residual_of_the_law() -> None:
-    rows = [
-        MeasuredPush(
-            push.edge_distance_m,
-            push.depth_m,
-            push.force_n * (1.0 + 4.0 * (push.depth_m - 0.02)),
-            RADIUS,
-        )
-        for push in pushes_of(ScaledSheetModel(NOMINAL))
-    ]
-    fit = fit_sheet_model(rows, NOMINAL)
-    table = tabulate_pushes(fit.law, rows, fit.used, NOMINAL.width_m)
-    for push in rows:
-        stretch = push.edge_distance_m / NOMINAL.width_m
-        pressed = table.evaluate(SheetPush(stretch, RADIUS), np.array([push.depth_m]))
-        assert pressed.force_n[0] == pytest.approx(push.force_n, rel=0.02)
-
-
-def test_a_table_needs_all_combinations() -> None:
-    rows = pushes_of(ScaledSheetModel(NOMINAL))
-    moved = MeasuredPush(
-        rows[0].edge_distance_m, 0.01, rows[1].force_n, RADIUS, position_m=(0.03, 0.0)
-    )
-    used = np.ones(len(rows) + 1, dtype=bool)
-    with pytest.raises(SheetModelFitError, match="all combinations"):
-        tabulate_pushes(ScaledSheetModel(NOMINAL), [*rows, moved], used, NOMINAL.width_m)
-    apart = [push for push in rows if (push.depth_m < 0.01) == (push.edge_distance_m < 0.25)]
-    with pytest.raises(SheetModelFitError, match="no common depth range"):
-        tabulate_pushes(ScaledSheetModel(NOMINAL), apart, used[: len(apart)], NOMINAL.width_m)
 
 
 CSV = """# measured on a bench
@@ -311,10 +260,8 @@ def twin_calibration() -> SheetCalibration:
     small = SCENE.model_copy(
         update={"working_range": SCENE.working_range.model_copy(update={"push_depth_m": 0.02})}
     )
-    rows = simulate_rows(small, places=False, noise_n=0.003, seed=2)
-    return make_calibration(
-        small, rows, list(range(len(rows))), source="twin", with_mooney=False, with_table=True
-    )
+    rows = simulate_rows(small, noise_n=0.003, seed=2)
+    return make_calibration(small, rows, list(range(len(rows))), source="twin")
 
 
 def test_twin_sheet_is_identified_from_its_pushes(twin_calibration: SheetCalibration) -> None:
@@ -324,11 +271,10 @@ def test_twin_sheet_is_identified_from_its_pushes(twin_calibration: SheetCalibra
     assert found.cubic_ratio.value == pytest.approx(1.0, abs=0.2)
     assert found.residual_rms_ratio < 0.07
     law = make_force_model(SCENE.sheet, found)
-    assert isinstance(law, TabulatedSheetModel)
     for stretch, depth in ((1.03, 0.009), (1.05, 0.016)):
         true = simulate_force(SCENE.sheet, stretch, depth, CENTRE, RADIUS)
         pressed = law.evaluate(SheetPush(stretch, RADIUS), np.array([depth]))
-        assert pressed.force_n[0] == pytest.approx(true, rel=0.04)
+        assert pressed.force_n[0] == pytest.approx(true, rel=0.06)
 
 
 def test_file_round_trip_keeps_the_law(twin_calibration: SheetCalibration, tmp_path: Path) -> None:
@@ -395,13 +341,10 @@ def test_the_command_fits_rows_and_reports(tmp_path: Path) -> None:
     assert reported["modulus_thickness_n_per_m"]["value"] == pytest.approx(1000.0, rel=0.02)
     assert [one["line"] for one in reported["left_out"]] == [8]
     assert SheetCalibration.load(file).source == str(rows)
-    shown = CliRunner().invoke(app, [*arguments, "--table"])
+    shown = CliRunner().invoke(app, arguments)
     assert shown.exit_code == 0, shown.output
     assert re.search(r"^left out line 8 +\S+$", shown.stdout, re.MULTILINE)
     assert "N/m" in shown.stdout
-    table = SheetCalibration.load(file).table
-    assert table is not None
-    assert table.stretch_ratios == pytest.approx([1.02, 1.04, 1.06, 1.09])
 
 
 @pytest.mark.parametrize("arguments", [[], ["--rows", "a.csv", "--twin", "b.yaml"]])

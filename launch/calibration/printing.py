@@ -1,4 +1,4 @@
-"""Write calibration boards as SVG or PNG files, to be printed at true size.
+"""Draw calibration boards as SVG, to be printed at true size.
 
 The first square is black. The white squares of a ChArUco board contain the markers. As OpenCV's
 detector requires, the marker numbers increase row by row.
@@ -6,15 +6,11 @@ detector requires, the marker numbers increase row by row.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.corners import CalibrationError, describe, make_charuco_board
+from flexsheet.launch.calibration.corners import describe, make_charuco_board
 from flexsheet.messages.calibration import Board
-from flexsheet.messages.files import write_file
 from flexsheet.nodes.arrays import Bools, Floats
 
 BORDER_SQUARES = 1.0
@@ -22,7 +18,6 @@ BORDER_SQUARES = 1.0
 
 CAPTION_MM = 8.0
 RULER_MM = 100.0
-PNG_DOTS_PER_INCH = 300
 
 
 def find_black_rectangles(board: Board) -> Floats:
@@ -104,36 +99,3 @@ def make_svg(board: Board) -> str:
             "</svg>\n",
         ]
     )
-
-
-def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
-    """Return the board as a grey image, which is 0 at black and 255 at white pixels.
-
-    A pixel is black if its centre is inside a black rectangle.
-    """
-    border = BORDER_SQUARES * board.square_m
-    across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
-    width, height = np.ceil(across * dots_per_m).astype(int)
-    image = np.full((height, width), 255, np.uint8)
-    for x, y, w, h in find_black_rectangles(board):
-        low = np.ceil((border + np.array([x, y])) * dots_per_m - 0.5).astype(int)
-        high = np.ceil((border + np.array([x + w, y + h])) * dots_per_m - 0.5).astype(int)
-        image[low[1] : high[1], low[0] : high[0]] = 0
-    return image
-
-
-def write_board(board: Board, path: Path) -> None:
-    """Write the board to a file, in the format that the suffix of the file name states.
-
-    Raises CalibrationError if the suffix is unknown or the board is unsuitable.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".svg":
-        write_file(path, make_svg(board))
-    elif suffix == ".png":
-        import matplotlib.image  # slow import
-
-        image = rasterize(board, PNG_DOTS_PER_INCH / 0.0254)
-        matplotlib.image.imsave(path, image, cmap="gray", vmin=0, vmax=255, dpi=PNG_DOTS_PER_INCH)
-    else:
-        raise CalibrationError(f"{path}: unknown image format; use .svg or .png")

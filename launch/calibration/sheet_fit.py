@@ -21,7 +21,6 @@ from flexsheet.nodes.models.sheet.force_models import (
     make_model,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
-from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 
 FORCE_NOISE_N = 0.01
 EDGE_NOISE_N = 0.1
@@ -168,48 +167,29 @@ def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) ->
     ]
 
 
-NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ratio")
+NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio")
 
 
-PRIOR_WIDTH_M, PRIOR_LOG_CUBIC = 0.0005, 0.2
-"""The standard deviations of the prior distributions of two fitted parameters.
-
-The first parameter is the unstretched width (m), which is measured with a ruler. The second is the
-logarithm of the cubic ratio, which is 1 for ideal rubber.
-"""
-
-
-def fit_sheet_model(
-    pushes: Sequence[MeasuredPush],
-    nominal: Rubber,
-    *,
-    with_mooney: bool = False,
-    with_prior: bool = False,
-) -> SheetModelFit:
+def fit_sheet_model(pushes: Sequence[MeasuredPush], nominal: Rubber) -> SheetModelFit:
     """Fit the parameters of the sheet's force model to measured pushes.
 
     The parameters are the product of modulus and thickness, the unstretched width, and the cubic
     ratio. The cubic ratio is the cubic term of the force divided by the cubic term of ideal rubber.
-    The weight of the Mooney term is a further, optional parameter. The least-squares fit is robust:
-    it first uses a soft-L1 loss, and then omits outliers.
+    The least-squares fit is robust: it first uses a soft-L1 loss, and then omits outliers.
 
     nominal: material parameters from which the fit starts.
-    with_mooney: whether the weight of the Mooney term is fitted.
-    with_prior: whether the nominal width and ideal rubber are used as prior values. If all pushes
-        have almost the same stretch, the prior values are needed to determine the width.
 
     Raises SheetModelFitError if there are too few pushes, or if they do not determine a parameter.
     """
-    names = NAMES if with_mooney else NAMES[:3]
-    if len(pushes) < 2 * len(names):
+    size = len(NAMES)
+    if len(pushes) < 2 * size:
         raise SheetModelFitError(
-            f"there are {len(pushes)} measured pushes, but fitting {', '.join(names)} requires "
-            f"{2 * len(names)}; measure more pushes"
+            f"there are {len(pushes)} measured pushes, but fitting {', '.join(NAMES)} requires "
+            f"{2 * size}; measure more pushes"
         )
-    start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0, 0.1])
-    low = np.array([start[0] - 7.0, -0.1, -2.0, 0.0])
-    high = np.array([start[0] + 7.0, 0.1, 2.0, 0.95])
-    size = len(names)
+    start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0])
+    low = np.array([start[0] - 7.0, -0.1, -2.0])
+    high = np.array([start[0] + 7.0, 0.1, 2.0])
 
     def build_model(numbers: Floats) -> ScaledSheetModel:
         return make_model(
@@ -217,28 +197,23 @@ def fit_sheet_model(
             modulus_thickness_n_per_m=float(np.exp(numbers[0])),
             slack_width_m=nominal.width_m * (1.0 + float(numbers[1])),
             cubic_ratio=float(np.exp(numbers[2])),
-            mooney_ratio=float(numbers[3]) if with_mooney else nominal.mooney_ratio,
         )
 
     def residuals(numbers: Floats, used: Bools) -> Floats:
         contact, edge = _residuals(build_model(numbers), pushes, nominal.width_m)
-        rows = np.concatenate([contact[used], edge[used & np.isfinite(edge)]])
-        if not with_prior:
-            return rows
-        width_sigmas = numbers[1] * nominal.width_m / PRIOR_WIDTH_M
-        return np.append(rows, [width_sigmas, numbers[2] / PRIOR_LOG_CUBIC])
+        return np.concatenate([contact[used], edge[used & np.isfinite(edge)]])
 
     used = np.ones(len(pushes), dtype=bool)
     for loss in ("soft_l1", "linear"):
         solved = least_squares(
             residuals,
-            start[:size],
+            start,
             args=(used,),
-            bounds=(low[:size], high[:size]),
+            bounds=(low, high),
             loss=loss,
-            x_scale=[1.0, 0.01, 0.3, 0.3][:size],
+            x_scale=[1.0, 0.01, 0.3],
         )
-        start[:size] = solved.x
+        start = solved.x
         if loss == "soft_l1":
             error = np.fmax(*np.abs(_residuals(build_model(solved.x), pushes, nominal.width_m)))
             used = error <= OUTLIER_SIGMAS * max(1.0, 1.4826 * float(np.median(error)))
@@ -260,14 +235,13 @@ def fit_sheet_model(
         law.rubber.young_modulus_pa * law.rubber.thickness_m,
         law.rubber.width_m,
         law.cubic_ratio,
-        law.rubber.mooney_ratio,
-    )[:size]
-    scale = (values[0], nominal.width_m, values[2], 1.0)[:size]
+    )
+    scale = (values[0], nominal.width_m, values[2])
     scaled = tuple(float(d) * one for d, one in zip(deviations, scale, strict=True))
     if deviations[0] > MAX_RELATIVE_DEVIATION or deviations[2] > 2.0 * MAX_RELATIVE_DEVIATION:
         index = 0 if deviations[0] > MAX_RELATIVE_DEVIATION else 2
         raise SheetModelFitError(
-            f"{names[index]} has an uncertainty of {100 * deviations[index]:.0f} %; add more "
+            f"{NAMES[index]} has an uncertainty of {100 * deviations[index]:.0f} %; add more "
             "stretches and greater depths"
         )
     ratio = _force_ratios(law, pushes, nominal.width_m)
@@ -277,7 +251,7 @@ def fit_sheet_model(
     groups = np.clip(_residuals(law, pushes, nominal.width_m), -OUTLIER_SIGMAS, OUTLIER_SIGMAS)
     return SheetModelFit(
         law=law,
-        names=names,
+        names=NAMES,
         values=values,
         standard_deviations=scaled,
         used=used,
@@ -337,56 +311,3 @@ def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m:
     measured = np.array([push.force_n for push in pushes])
     ratios: Floats = measured / np.maximum(forces, 1e-6) - 1.0
     return ratios
-
-
-def tabulate_pushes(
-    law: ScaledSheetModel, pushes: Sequence[MeasuredPush], used: Bools, nominal_width_m: float
-) -> TabulatedSheetModel:
-    """Make a table of the ratio of measured to modelled force, from n measured pushes.
-
-    The axes of the table are stretch, depth, and the distances of the push from the sheet's centre
-    along x and y. Pushes must exist at every combination of stretch, x and y. The depths can differ
-    between combinations. The ratios are interpolated at depths that all combinations cover.
-
-    used: mask (n,) that selects the pushes to use.
-
-    Raises SheetModelFitError if a combination is missing.
-    """
-    cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
-    ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0
-    for push, ratio, good in zip(pushes, ratios, used, strict=True):
-        key = (
-            round(push.edge_distance_m / nominal_width_m, 4),
-            round(abs(push.position_m[0]), 4),
-            round(abs(push.position_m[1]), 4),
-        )
-        if good and push.force_n > 3.0 * FORCE_NOISE_N:
-            cells.setdefault(key, []).append((push.depth_m, float(ratio)))
-    axes = [sorted({key[number] for key in cells}) for number in range(3)]
-    missing = [
-        (s, x, y) for s in axes[0] for x in axes[1] for y in axes[2] if (s, x, y) not in cells
-    ]
-    if not cells or missing:
-        where = f" at stretch, x, y {missing[0]}" if missing else ""
-        raise SheetModelFitError(
-            f"there are no usable rows{where}; measure pushes at all combinations of stretch and "
-            "position"
-        )
-    shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
-    deepest = min(max(depth for depth, _ in rows) for rows in cells.values())
-    if not shallowest < deepest:
-        raise SheetModelFitError(
-            "the stretches and positions have no common depth range; measure pushes at the same "
-            "depths for all stretches and positions"
-        )
-    count = min(len({depth for depth, _ in rows}) for rows in cells.values())
-    depths = np.geomspace(shallowest, deepest, max(2, min(count, 12)))
-    entries = np.empty((len(axes[0]), len(depths), len(axes[1]), len(axes[2])))
-    for (s, x, y), rows in cells.items():
-        known = np.unique([depth for depth, _ in rows])
-        means = [np.mean([r for depth, r in rows if depth == one]) for one in known]
-        index = (axes[0].index(s), slice(None), axes[1].index(x), axes[2].index(y))
-        entries[index] = np.interp(np.log(depths), np.log(known), means)
-    return TabulatedSheetModel(
-        law, np.array(axes[0]), depths, np.array(axes[1]), np.array(axes[2]), entries
-    )

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from itertools import product
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -127,17 +126,11 @@ def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: floa
 
 SIMULATED_DEPTHS_M = (0.002, 0.004, 0.007, 0.012, 0.020, 0.030, 0.040, 0.050)
 SIMULATED_STRETCHES = 4
-SIMULATED_XS, SIMULATED_YS = (0.0, 0.13, 0.25), (0.0, 0.19, 0.36)
-"""The simulated contact points, as fractions of the sheet's width (x) and height (y).
-
-The positions are relative to the sheet's centre.
-"""
 
 
 def simulate_rows(
     scene: Scene,
     *,
-    places: bool,
     noise_n: float,
     seed: int,
     apparatus: Apparatus | None = None,
@@ -148,23 +141,26 @@ def simulate_rows(
     There is one push at each depth. If the rubber has hysteresis, there are two pushes at each
     depth, one for loading and one for unloading.
 
-    places: whether to push at several points of the sheet, not only at its centre.
     noise_n: standard deviation of the noise of the contact force, N. The noise of the edge force is
         ten times as large.
     apparatus: true parameters of the arms and the sheet. If None, the scene's parameters are used.
-    progress: function that is called after each combination of stretch and contact point. Its
-        arguments are the number of finished combinations and the number of all combinations.
+    progress: function that is called after each stretch. Its arguments are the number of
+        finished stretches and the number of all stretches.
     """
     rng = np.random.default_rng(seed)
     sheet = SimulatedSheet(scene, apparatus or nominal_apparatus(scene))
     radius_m = scene.finger.radius_m
     pushes: list[MeasuredPush] = []
-    cases = list(_simulated_cases(scene, places))
+    stretches = np.linspace(
+        max(scene.sheet.min_stretch_ratio, 1.005),
+        scene.sheet.max_stretch_ratio,
+        SIMULATED_STRETCHES,
+    )
     most_m = scene.working_range.push_depth_m + 1e-9
     depths_m = [depth_m for depth_m in SIMULATED_DEPTHS_M if depth_m <= most_m]
-    for done, (stretch, point_m) in enumerate(cases, start=1):
+    for done, stretch in enumerate(stretches.tolist(), start=1):
         distance_m = stretch * scene.sheet.width_m
-        pushed = sheet.push(distance_m, depths_m, point_m, radius_m)
+        pushed = sheet.push(distance_m, depths_m, (0.0, 0.0), radius_m)
         for depth_m, (forces_n, edge_force_n) in zip(depths_m, pushed, strict=True):
             hysteresis = forces_n[0] != forces_n[1]
             for force_n, unloading in zip(forces_n, (False, True), strict=True):
@@ -176,24 +172,9 @@ def simulate_rows(
                         depth_m=depth_m,
                         force_n=force_n + float(rng.normal(0.0, noise_n)),
                         finger_radius_m=radius_m,
-                        position_m=point_m,
                         edge_force_n=edge_force_n + float(rng.normal(0.0, 10.0 * noise_n)),
                         unloading=unloading if hysteresis else None,
                     )
                 )
-        progress(done, len(cases))
+        progress(done, len(stretches))
     return pushes
-
-
-def _simulated_cases(scene: Scene, places: bool) -> Iterator[tuple[float, tuple[float, float]]]:
-    """Yield each simulated combination of a stretch ratio and a contact point (x, y), in m.
-
-    places: whether to use points all over the sheet, not only its centre.
-    """
-    sheet = scene.sheet
-    stretches = np.linspace(
-        max(sheet.min_stretch_ratio, 1.005), sheet.max_stretch_ratio, SIMULATED_STRETCHES
-    )
-    xs, ys = (SIMULATED_XS, SIMULATED_YS) if places else ((0.0,), (0.0,))
-    for stretch, x, y in product(stretches, xs, ys):
-        yield float(stretch), (x * sheet.width_m, y * sheet.height_m)

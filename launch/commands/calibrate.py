@@ -121,9 +121,6 @@ def stereo(
     ] = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Folder to write a report with plots to.")
-    ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate both cameras of a stereo camera and their relative pose.
@@ -174,17 +171,10 @@ def stereo(
             progress=progress,
         )
     calibrated.calibration.save(output, comment=command_line())
-    page: Path | None = None
-    if report is not None:
-        from flexsheet.launch.calibration.report import write_report
-
-        page = write_report(calibrated, report)
-    _print_result(calibrated.calibration, output, page, as_json)
+    _print_result(calibrated.calibration, output, as_json)
 
 
-def _print_result(
-    calibration: StereoCalibration, output: Path, page: Path | None, as_json: bool
-) -> None:
+def _print_result(calibration: StereoCalibration, output: Path, as_json: bool) -> None:
     uncertainty = calibration.uncertainty
     assert uncertainty is not None
     result = {
@@ -201,7 +191,6 @@ def _print_result(
             "lateral_std_mm": 1e3 * uncertainty.lateral_std_m,
             "jackknife_ratio": uncertainty.jackknife_ratio,
         },
-        "report": None if page is None else str(page),
     }
     print_result(result, as_json=as_json)
 
@@ -255,7 +244,7 @@ def print_board(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, options.result_file("Image file to write (.svg or .png).", "IMAGE")],
+    output: Annotated[Path, options.result_file("Image file to write (.svg).", "IMAGE")],
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: options.JsonOption = False,
@@ -264,10 +253,13 @@ def print_board(
 
     The board is a ChArUco board if --marker-mm is given. Otherwise, it is a chessboard.
     """
-    from flexsheet.launch.calibration.printing import make_caption, write_board
+    from flexsheet.launch.calibration.printing import make_caption, make_svg
+    from flexsheet.messages.files import write_file
 
     described = parse_board(board, square_mm, marker_mm, dictionary)
-    write_board(described, output)
+    if output.suffix.lower() != ".svg":
+        raise CommandError(f"--output {output}: the board is an SVG file; use .svg")
+    write_file(output, make_svg(described))
     if as_json:
         print_json({"file": str(output), "board": described.model_dump(mode="json")})
     else:

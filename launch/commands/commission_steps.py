@@ -275,17 +275,13 @@ class Laboratory:
             pushes, lines = read_rows(file, scene.sheet, scene.finger.radius_m)
             source, mass_kg_per_m2 = str(file), self.sheet_kg_per_m2
         else:
-            pushes = calibrate_sheet.simulate_pushes(
-                scene, self.apparatus, places=False, seed=self.seed
-            )
+            pushes = calibrate_sheet.simulate_pushes(scene, self.apparatus, seed=self.seed)
             lines, source = list(range(1, len(pushes) + 1)), f"twin of {scene.name}"
             true = apply_apparatus(scene, self.apparatus).sheet
             weighing = np.random.default_rng([self.seed, 3]).normal(1.0, WEIGHING_RATIO)
             mass_kg_per_m2 = float(true.density_kg_per_m3 * true.thickness_m * weighing)
         try:
-            found = calibrate_sheet.make_calibration(
-                scene, pushes, lines, source=source, with_mooney=False, with_table=False
-            )
+            found = calibrate_sheet.make_calibration(scene, pushes, lines, source=source)
         except SheetModelFitError as error:
             raise CommissionError(
                 f"the sheet cannot be calibrated with the data of {source}: {error}"

@@ -36,19 +36,11 @@ def make_force_model(
     if calibration is None:
         return ScaledSheetModel(rubber)
     refuse_other_sheet(calibration, sheet)
-    mooney = calibration.mooney_ratio
-    model = make_model(
+    return make_model(
         rubber,
         modulus_thickness_n_per_m=float(calibration.modulus_thickness_n_per_m.value),
         slack_width_m=float(calibration.slack_width_m.value),
         cubic_ratio=float(calibration.cubic_ratio.value),
-        mooney_ratio=0.0 if mooney is None else float(mooney.value),
-    )
-    table = calibration.table
-    if table is None:
-        return model
-    return TabulatedSheetModel(
-        model, table.stretch_ratios, table.depths_m, table.xs_m, table.ys_m, table.ratios
     )
 
 

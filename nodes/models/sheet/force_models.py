@@ -297,7 +297,6 @@ def make_model(
     modulus_thickness_n_per_m: float,
     slack_width_m: float,
     cubic_ratio: float,
-    mooney_ratio: float,
 ) -> ScaledSheetModel:
     """Make the closed-form force model from calibrated parameters.
 
@@ -308,6 +307,5 @@ def make_model(
         nominal,
         width_m=slack_width_m,
         young_modulus_pa=modulus_thickness_n_per_m / nominal.thickness_m,
-        mooney_ratio=mooney_ratio,
     )
     return ScaledSheetModel(rubber, cubic_ratio, nominal.width_m / slack_width_m)
