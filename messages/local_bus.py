@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -24,23 +24,25 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import INLINE_BYTES, Codec, Envelope, WireError, get_codec
 
+if TYPE_CHECKING:
+    from flexsheet.messages.bus import Subscriber
+
 _SCALARS = frozenset((bool, int, float, str, type(None)))
 
 
 class LocalEnvelope(Envelope):
     """A message for the subscribers in the sender's process.
 
-    The message is copied and validated at most once, for all subscribers together.
+    The message is copied once, for all subscribers together, and a valid one is validated once.
 
     array_bytes: total size of the message's arrays.
     """
 
-    __slots__ = ("_error", "_message", "array_bytes")
+    __slots__ = ("_message", "array_bytes")
 
     def __init__(self, codec: Codec, header: Header, original: Message) -> None:
         self.codec, self.header = codec, header
         self._message: Message | None = None
-        self._error: WireError | None = None
         self.array_bytes = 0
         self.fields = self._share_fields(original.__dict__)
 
@@ -49,15 +51,8 @@ class LocalEnvelope(Envelope):
 
         Raises WireError if a field is invalid.
         """
-        if self._message is not None:
-            return self._message
-        if self._error is not None:
-            raise self._error
-        try:
+        if self._message is None:
             self._message = super().open()
-        except WireError as error:
-            self._error = error
-            raise
         return self._message
 
     def _share_fields(self, fields: dict[Any, Any]) -> dict[Any, Any]:
@@ -81,17 +76,6 @@ class LocalEnvelope(Envelope):
         if isinstance(value, dict):
             return self._share_fields(value)
         return value
-
-
-class LocalReceiver(Protocol):
-    """The interface of a subscriber that receives messages from its own process."""
-
-    topic: Topic
-    counts: Any
-    on_disconnected: Callable[[], None] | None
-
-    def accept_header(self, header: Header, writers: frozenset[str] | None) -> bool: ...
-    def deliver(self, envelope: Envelope) -> None: ...
 
 
 class LocalChannel:
@@ -168,7 +152,7 @@ class LocalConnection:
 
     def __init__(
         self,
-        receiver: LocalReceiver,
+        receiver: Subscriber,
         channels: Sequence[LocalChannel],
         writers: frozenset[str] | None,
         *,
@@ -217,11 +201,6 @@ class LocalConnection:
         """Deliver the messages that are in the queue at the start of this call."""
         self._scheduled = False
         waiting, accept = self._waiting, self._receiver.accept_header
-        if len(waiting) == 1:
-            envelope = waiting.popleft()
-            if accept(envelope.header, self._writers):
-                self._receiver.deliver(envelope)
-            return
         accepted: list[LocalEnvelope] = []
         while waiting:
             envelope = waiting.popleft()
