@@ -254,7 +254,6 @@ def test_a_chart_is_measured_drawn_and_written(tmp_path: Path) -> None:
     assert result["machine"]
     drawn = picture.read_text()
     assert f"stroke: {INK}" in drawn
-    assert "prefers-color-scheme: dark" in drawn
     write_chart(result, tmp_path / "charts")
     assert picture.read_text() == drawn, "the same numbers give the same picture"
 
