@@ -89,12 +89,7 @@ def make_detector_config() -> DetectorConfig:
     """Make the settings of a marker detector from the triangulator's default parameters."""
     given = TriangulatorParameters()
     return DetectorConfig(
-        blob_filter=BlobFilter(
-            min_contrast=given.marker_min_contrast,
-            min_area_px=given.marker_min_area_px,
-            max_area_px=given.marker_max_area_px,
-            window_half_px=given.window_half_px,
-        ),
+        blob_filter=BlobFilter(min_contrast=given.marker_min_contrast),
         max_reprojection_px=given.max_reprojection_px,
     )
 

@@ -33,6 +33,9 @@ from flexsheet.nodes.planner.timing import (
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 
 FIRST_HORIZON_S = 0.05
+MAX_ACTUATION_DELAY_S = 0.15
+"""The maximum actuation delay (s) that is measured and used."""
+
 MAX_FUTURE_S = 0.005
 """The maximum time (s) by which the timestamp of a fingertip message may be in the future."""
 
@@ -76,10 +79,8 @@ class Planner(Node):
         self._timestamps = MonotonicTimestampFilter()
         self._writer = ("", 0)
         self._first_step_s = 0.0
-        self._actuation = ActuationDelayEstimator(
-            self.parameters.actuation_delay_s,
-            max(self.parameters.max_actuation_delay_s, self.parameters.actuation_delay_s),
-        )
+        initial_s = self.parameters.actuation_delay_s
+        self._actuation = ActuationDelayEstimator(initial_s, max(MAX_ACTUATION_DELAY_S, initial_s))
         fixed_s = self.parameters.prediction_horizon_s
         self._horizon_s = FIRST_HORIZON_S if fixed_s is None else fixed_s
         self._late_count, self._model_text = 0, ""
@@ -121,8 +122,7 @@ class Planner(Node):
             self._update_note()
 
     def on_arm_latency(self, arm: ArmLatency, header: Header) -> None:
-        if self.parameters.measure_actuation_delay:
-            self._actuation.on_latency(arm.side, arm.latency_s)
+        self._actuation.on_latency(arm.side, arm.latency_s)
 
     def _update_note(self) -> None:
         stopped = self._stopped_oscillations

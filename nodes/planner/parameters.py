@@ -25,13 +25,7 @@ class PlannerParameters(NodeParameters):
     actuation_delay_s: NonNegative = Field(
         default=0.036,
         description="time from the publication of a fingertip measurement until the sheet has "
-        "moved, s. If measure_actuation_delay is true, this is the initial value",
-    )
-    measure_actuation_delay: bool = Field(
-        default=True, description="whether to use the actuation delay that the arms measure"
-    )
-    max_actuation_delay_s: Positive = Field(
-        default=0.15, description="maximum actuation delay that is measured and used, s"
+        "moved, s, until the arms have measured it",
     )
     compliance_mode: ComplianceMode | None = Field(
         default=None,

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from flexsheet.nodes.renderer.frame_renderer import FrameRenderer
     from flexsheet.nodes.renderer.output_window import OutputWindow
 
+IDLE_PERIOD_NS = 1_000_000_000
+"""The period (ns) of the frames while nothing moves and no finger is tracked."""
+
 READ_TIME_NS = 2_000_000
 """The minimum time (ns) between the end of one frame and the start of the next frame."""
 
@@ -76,7 +79,7 @@ class Renderer(Node):
         self._max_age = MaxAge(self.parameters.max_age_s)
         self._due_ns = self._since_pixels = 0
         self._period_ns = int(1e9 / self.parameters.rate_hz)
-        self._idle_period_ns, self._drawn_ns = int(1e9 / self.parameters.idle_rate_hz), 0
+        self._drawn_ns = 0
 
     async def close(self) -> None:
         self._output.close()
@@ -166,7 +169,7 @@ class Renderer(Node):
         if self._frame_renderer is None or now_ns < self._due_ns - self._period_ns // 4:
             return
         idle_ns = now_ns - self._drawn_ns + self._period_ns // 4
-        if idle_ns < self._idle_period_ns and self._frame_renderer.is_unchanged(self._shown):
+        if idle_ns < IDLE_PERIOD_NS and self._frame_renderer.is_unchanged(self._shown):
             return
         self._drawn_ns = now_ns
         self._draw(self._frame_renderer, now_ns)

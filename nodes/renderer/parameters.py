@@ -15,9 +15,6 @@ from flexsheet.nodes.node import NodeParameters
 
 class RendererParameters(NodeParameters):
     rate_hz: Positive = Field(default=30.0, description="Maximum frame rate, Hz.")
-    idle_rate_hz: Positive = Field(
-        default=1.0, description="Frame rate, Hz, while nothing moves and no finger is tracked."
-    )
     output: Literal["headless", "window"] = Field(
         default="headless",
         description="Output of the frames. headless: draw without a window. window: show frames "

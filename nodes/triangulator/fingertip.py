@@ -89,7 +89,6 @@ class DetectorConfig:
 
     blob_filter: criteria for a blob that may be the marker.
     max_reprojection_px: maximum reprojection error of a pair.
-    noise_px: standard deviation of a marker's centre; None to use the estimate of the fit.
     marker_radius_m: true radius of the marker.
     max_deviation_m: maximum standard deviation of a triangulated point.
     sensor: noise of the pixels.
@@ -97,7 +96,6 @@ class DetectorConfig:
 
     blob_filter: BlobFilter
     max_reprojection_px: float
-    noise_px: float | None = None
     marker_radius_m: float = 0.003
     max_deviation_m: float = 0.002
     sensor: PixelNoise = field(default_factory=PixelNoise)
@@ -548,17 +546,13 @@ def _triangulate(
     inputs: DetectionInput, markers: tuple[Marker, Marker]
 ) -> TriangulatedPoint | None:
     """Triangulate a marker from its refined centres in both views, or return None if this fails."""
-    noise_px, occlusion = inputs.config.noise_px, _occlusion_variance_px2(markers) * np.eye(2)
-    left, right = (
-        (marker.covariance if noise_px is None else noise_px**2 * np.eye(2)) + occlusion
-        for marker in markers
-    )
+    occlusion = _occlusion_variance_px2(markers) * np.eye(2)
     return measure(
         inputs.geometry,
         markers[0].centre + inputs.origins[0],
         markers[1].centre + inputs.origins[1],
-        covariance=left,
-        right_covariance=right,
+        covariance=markers[0].covariance + occlusion,
+        right_covariance=markers[1].covariance + occlusion,
     )
 
 

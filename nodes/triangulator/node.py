@@ -119,13 +119,7 @@ class Triangulator(Node):
         )
         self.reasons: Counter[FingertipReason] = Counter()
         self.config = DetectorConfig(
-            blob_filter=BlobFilter(
-                min_contrast=p.marker_min_contrast,
-                min_area_px=p.marker_min_area_px,
-                max_area_px=p.marker_max_area_px,
-                window_half_px=p.window_half_px,
-            ),
-            noise_px=p.marker_noise_px,
+            blob_filter=BlobFilter(min_contrast=p.marker_min_contrast),
             marker_radius_m=p.marker_radius_m,
             max_reprojection_px=p.max_reprojection_px,
             sensor=PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level),

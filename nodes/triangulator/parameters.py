@@ -25,11 +25,6 @@ class TriangulatorParameters(NodeParameters):
         description="calibration file from `flexsheet calibrate marker`; null: "
         "finger.marker_from_pad_m of the scene is used",
     )
-    marker_noise_px: Positive | None = Field(
-        default=None,
-        description="standard deviation of a marker's centre, px; null: the estimate of the fit is "
-        "used",
-    )
     marker_radius_m: Positive = Field(
         default=0.003, description="true radius of the marker (ball or flat disc), m"
     )
@@ -40,20 +35,6 @@ class TriangulatorParameters(NodeParameters):
         default=60.0,
         description="minimum contrast of a marker: its grey level minus the grey level of its "
         "surroundings",
-    )
-    marker_min_area_px: Annotated[int, Field(ge=1)] = Field(
-        default=4, description="minimum area of a marker in an image, pixels"
-    )
-    marker_max_area_px: Annotated[int, Field(ge=1)] = Field(
-        default=1500, description="maximum area of a marker in an image, pixels"
-    )
-    window_half_px: Annotated[int, Field(ge=8)] = Field(
-        default=16, description="half the side of the smallest search window, px"
-    )
-    max_acceleration_m_per_s2: Positive = Field(
-        default=60.0,
-        description="maximum acceleration of a finger, m/s^2; a point that requires a larger "
-        "acceleration is rejected",
     )
     track_timeout_s: Positive = Field(
         default=0.1,
@@ -81,7 +62,6 @@ class TriangulatorParameters(NodeParameters):
         """Return the settings of a tracker for a finger with the given maximum speed."""
         return TrackingSettings(
             max_speed_m_per_s=max_speed_m_per_s,
-            max_acceleration_m_per_s2=self.max_acceleration_m_per_s2,
             track_timeout_s=self.track_timeout_s,
             confirm_frames=self.confirm_frames,
         )
