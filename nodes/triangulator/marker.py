@@ -293,9 +293,6 @@ grey levels above its surroundings)."""
 SHARP_PX = 1.2
 """The maximum standard deviation of the edge blur at which a marker is in focus."""
 
-MAX_SPREAD = 1.7
-"""The maximum value of `Blob.spread`. A blob with a larger spread is not a marker."""
-
 
 STILL_ERROR_PX, MOVING_ERROR = 0.004, 0.005
 """The standard deviations of the errors of a fitted centre that do not come from image noise, in
