@@ -68,7 +68,8 @@ def test_the_table_is_computed_once_in_the_nodes_cache(
     monkeypatch: pytest.MonkeyPatch,
     flexsheet: Callable[..., tuple[int, str]],
 ) -> None:
-    arguments = ("prepare", scene_file, "--cache", tmp_path / "cache", "--skin-spacing", SPACING_M)
+    cache = tmp_path / "cache"
+    arguments = ("precompute", scene_file, "--cache", cache, "--skin-spacing", SPACING_M)
     code, printed = flexsheet(*arguments)
     assert code == 0
     assert ": 0 % (" in printed.split("snapshots for")[0]  # what it will take, before it is begun
@@ -102,7 +103,7 @@ def test_impossible_requests_are_rejected_with_an_error_text(
     options: tuple[str, ...],
     named: str,
 ) -> None:
-    code, printed = flexsheet("prepare", scene_file, "--cache", tmp_path, *options)
+    code, printed = flexsheet("precompute", scene_file, "--cache", tmp_path, *options)
     assert code == 2
     assert named in printed.replace("│ ", "").replace(" │", "")
     assert "Traceback" not in printed
