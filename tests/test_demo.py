@@ -15,24 +15,15 @@ from flexsheet.launch.experiments import (
     demo,
     image,
     run,
-    stroke,
 )
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import Run
-from flexsheet.messages.types import FingerPath
 from tests.commands import Command
 from tests.test_followed import LABEL, write_hand
 from tests.test_planner import SCENE
 
 DRIVER = Driver(load_graph(run.DEMO_FILE), Run("unused", Path("unused")))
-PATH = FingerPath(
-    label=LABEL,
-    times_s=np.array([1.0, 2.0]),
-    positions_world_m=np.zeros((2, 3)),
-    wander_m=0.0,
-    tremor_m=0.0,
-)
 ERRORS = {"mean": 0.0625, "std": 0.04}
 STROKE = {
     "seconds": 10.0,
@@ -43,25 +34,9 @@ STROKE = {
 }
 
 
-async def test_a_finished_path_is_reported_and_saved_while_the_graph_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "DELIVERY_S", 0.1)
-    monkeypatch.setattr(stroke, "read_recording", lambda bag: None)
-    monkeypatch.setattr(demo, "draw_latency", lambda recording, path: None)
-    bag, reported = write_hand(tmp_path / "demo.mcap"), list[demo.DemoResult]()
-    _, evaluate, *images = demo.make_demo_procedures(bag, print, reported.append, PATH)
-    await evaluate(DRIVER, SCENE)
-    assert len(images) == 4
-    (result,) = reported
-    assert result.followed == json.loads((tmp_path / "followed.json").read_text())
-    assert result.followed["path"] == LABEL
-
-
 def test_a_path_is_recorded_only_after_its_end(tmp_path: Path) -> None:
     bag = write_hand(tmp_path / "a.mcap")  # ends 0.2 s after the path
     assert not run.is_path_recorded(bag, LABEL)
-    assert demo.evaluate_path(bag, LABEL) is None
     assert not run.is_path_recorded(bag, "another")
 
 
@@ -119,9 +94,7 @@ def test_the_demo_ends_with_the_files_and_what_they_show(
     ) -> None:
         report(demo.DemoResult(figures=[demo.DemoFigure(bag.parent / "latency.png", "delays")]))
         sizes = {"sheet": "tilted", "correction": "two_pass", "mean_mm": 0.125, "max_mm": 4.25}
-        report(
-            demo.DemoResult([], None, [sizes], [demo.DemoFigure(bag.parent / "eye.png", "images")])
-        )
+        report(demo.DemoResult([], [sizes], [demo.DemoFigure(bag.parent / "eye.png", "images")]))
 
     monkeypatch.setattr(demo, "run_demo", run_short)
     code, out, err = flexsheet("demo", "--output", tmp_path)

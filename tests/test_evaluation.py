@@ -150,7 +150,7 @@ def test_progress_names_the_time_left(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_trial_is_a_process_whose_error_comes_back() -> None:
     with pytest.raises(TrialError, match=r"missing\.yaml"):
-        execute_trial({"kind": "stroke", "launch_file": "missing.yaml", "seconds": 3})
+        execute_trial({"kind": "sensitivity", "launch_file": "missing.yaml", "settings": []})
 
 
 def test_graphs_of_trials_use_other_ports() -> None:

@@ -64,10 +64,7 @@ def test_the_placement_of_a_recorded_motion_is_stated(
     assert "flexsheet topic pub twin/finger_path" in printed
 
 
-@pytest.mark.parametrize("command", [("experiment", "follow"), ("demo",)])
-def test_a_wrong_name_is_answered_in_a_sentence(
-    command: tuple[str, ...], flexsheet: Command
-) -> None:
-    printed = flexsheet(*command, "--finger-path", "tapp")
+def test_a_wrong_name_is_answered_in_a_sentence(flexsheet: Command) -> None:
+    printed = flexsheet("experiment", "follow", "--finger-path", "tapp")
     assert printed.code == 2
     assert 'did you mean "tap"?' in printed.err

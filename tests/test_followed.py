@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from flexsheet.launch.bags.report import make_result, read_session
 from flexsheet.launch.commands.experiment import print_followed
 from flexsheet.launch.experiments import ExperimentError, stroke
-from flexsheet.launch.experiments.demo import read_followed_path
-from flexsheet.launch.experiments.followed import read_followed, summarize_path
+from flexsheet.launch.experiments.followed import read_followed, read_followed_path, summarize_path
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.scene import Plane, Sphere

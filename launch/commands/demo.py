@@ -5,15 +5,11 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.experiment import (
-    announce_recording,
     make_result_folder,
-    print_followed,
     print_strokes,
 )
 from flexsheet.launch.commands.output import (
@@ -31,23 +27,13 @@ if TYPE_CHECKING:
 app = options.make_app()
 
 
-@app.command(
-    epilog=examples("flexsheet demo", "flexsheet demo --finger-path tap --output runs/tap --json")
-)
+@app.command(epilog=examples("flexsheet demo", "flexsheet demo --output runs/demo --json"))
 def demo(
     *,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
     apparatus: options.ApparatusOption = None,
-    finger_path: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME_OR_FILE",
-            help="Finger path to follow instead of the strokes: name of a gesture, or CSV file "
-            "(columns t_s,x_mm,y_mm,z_mm).",
-        ),
-    ] = None,
     output: options.ResultFolderOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -56,19 +42,13 @@ def demo(
     The result of each experiment is printed and saved when the experiment is finished.
     """
     from flexsheet.launch.experiments.demo import DemoResult, run_demo
-    from flexsheet.launch.experiments.finger_paths import finger_path as load_path
 
     given = options.with_scene(settings, scene)
-    path = None
-    if finger_path is not None:
-        path = load_path(launch_file, finger_path, given)
-        announce_recording(finger_path, path)
     folder = make_result_folder(output, "demo")
     bag, results = folder / "demo.mcap", DemoResult()
 
     def report(new: DemoResult) -> None:
         results.strokes += new.strokes
-        results.followed = new.followed or results.followed
         results.images += new.images
         figures = [one for one in new.figures if one not in results.figures]
         results.figures += figures
@@ -77,7 +57,7 @@ def demo(
 
     try:
         with progress_words() as progress:
-            run_demo(launch_file, given, bag, progress, report, path=path, apparatus=apparatus)
+            run_demo(launch_file, given, bag, progress, report, apparatus=apparatus)
     except FlexsheetError:
         if as_json and bag.exists():
             _print_results(results, bag)
@@ -91,8 +71,6 @@ def demo(
 def _print_result(result: DemoResult) -> None:
     if result.strokes:
         print_strokes(result.strokes)
-    if result.followed is not None:
-        print_followed([result.followed])
     if result.images:
         print_columns(
             result.images,
@@ -122,7 +100,6 @@ def _print_results(result: DemoResult, bag: Path) -> None:
     print_json(
         {
             "strokes": result.strokes,
-            "followed": result.followed,
             "images": result.images,
             "bag": str(bag),
             "figures": [str(figure.path) for figure in result.figures],

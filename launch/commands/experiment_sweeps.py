@@ -59,10 +59,6 @@ def robustness(
     seconds: StrokeOption = 10.0,
     workers: options.WorkersOption = 1,
     scheduler: options.SchedulerOption = None,
-    keep_bags: Annotated[
-        bool,
-        typer.Option("--keep-bags", help="Keep the recording of each trial in the output folder."),
-    ] = False,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
@@ -93,7 +89,6 @@ def robustness(
             seconds=seconds,
             workers=workers,
             scheduler=scheduler,
-            keep_bags=keep_bags,
             commissioned=commissioned,
         )
     if as_json:

@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flexsheet.launch.experiments import find_recorded, image, stroke
-from flexsheet.launch.experiments.followed import read_followed
+from flexsheet.launch.experiments import image, stroke
 from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from flexsheet.launch.experiments.run import (
     Procedure,
@@ -25,7 +24,7 @@ from flexsheet.launch.experiments.run import (
 )
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import require_cylinder
-from flexsheet.messages.types import Correction, FingerPath
+from flexsheet.messages.types import Correction
 
 METRES_PER_PX = 0.0007
 """The image resolution in Furukawa et al. 2007.
@@ -69,12 +68,10 @@ class DemoResult:
     """The results of all finished experiments of the demo.
 
     strokes: one result per stroke of the finger.
-    followed: errors of the sheet along the given finger path; None if no path was given.
     images: errors (mm) of the sizes that the eye sees, for each sheet and image correction.
     """
 
     strokes: list[dict[str, Any]] = field(default_factory=list)
-    followed: dict[str, Any] | None = None
     images: list[dict[str, Any]] = field(default_factory=list)
     figures: list[DemoFigure] = field(default_factory=list)
 
@@ -89,16 +86,15 @@ def run_demo(
     progress: Progress,
     report: Report,
     *,
-    path: FingerPath | None = None,
     apparatus: str | None = None,
 ) -> None:
     """Run the demo on a graph, and report the result of each experiment when it is finished.
 
-    The finger makes strokes of 10 s and 30 s, or follows `path`. Images of a tilted and of a pushed
+    The finger makes strokes of 10 s and 30 s. Images of a tilted and of a pushed
     sheet are captured. Results and figures are written to the folder of the bag. The function
     `report` receives the new results.
     """
-    procedure = chain_procedures(*make_demo_procedures(bag, progress, report, path))
+    procedure = chain_procedures(*make_demo_procedures(bag, progress, report))
     coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     given = [*coarse, *settings]
     run_experiment(
@@ -113,23 +109,16 @@ def run_demo(
     )
 
 
-def make_demo_procedures(
-    bag: Path, progress: Progress, report: Report, path: FingerPath | None
-) -> list[Procedure]:
+def make_demo_procedures(bag: Path, progress: Progress, report: Report) -> list[Procedure]:
     """Make the procedures (coroutines) that run the experiments of the demo and evaluate them."""
     made: list[Procedure] = []
 
     def add(procedure: Procedure, evaluate: Callable[[], DemoResult | None], name: str) -> None:
         made.extend((procedure, make_evaluation(bag, evaluate, report, name)))
 
-    if path is None:
-        for number, seconds in enumerate(SECONDS, 1):
-            evaluate = partial(evaluate_strokes, bag, SECONDS[:number])
-            procedure = make_stroke_procedure([seconds], progress)
-            add(procedure, evaluate, stroke.stroke_label(seconds))
-    else:
-        procedure = make_stroke_procedure((), progress, path=path)
-        add(procedure, partial(evaluate_path, bag, path.label), path.label)
+    for number, seconds in enumerate(SECONDS, 1):
+        evaluate = partial(evaluate_strokes, bag, SECONDS[:number])
+        add(make_stroke_procedure([seconds], progress), evaluate, stroke.stroke_label(seconds))
     for number, (series, value, corrections) in enumerate(IMAGES, 1):
         procedure = make_image_procedure(series, [value], corrections, progress, shading="soft")
         add(procedure, partial(evaluate_images, bag, number), series.name.format(value))
@@ -157,33 +146,6 @@ def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
     draw_latency(recording, latency)
     figures = [DemoFigure(plot, STROKE_FIGURE), DemoFigure(latency, LATENCY_FIGURE)]
     return DemoResult(strokes=results[-1:], figures=figures)
-
-
-def evaluate_path(bag: Path, label: str) -> DemoResult | None:
-    """Evaluate how the sheet followed a finger path, and write the results and a figure to files.
-
-    Return None if the bag does not yet contain the path.
-
-    label: label of the finger path.
-    """
-    if not is_path_recorded(bag, label):
-        return None
-    followed = read_followed_path(bag, label)
-    write_file(bag.parent / "followed.json", json.dumps(followed, indent=1) + "\n")
-    latency = bag.parent / "latency.png"
-    draw_latency(stroke.read_recording(bag), latency)
-    return DemoResult(followed=followed, figures=[DemoFigure(latency, LATENCY_FIGURE)])
-
-
-def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
-    """Return the sheet's errors while it followed a finger path, from a bag.
-
-    label: label of the finger path.
-
-    Raises ExperimentError if the bag does not contain the path.
-    """
-    runs = {run["path"]: run for run in read_followed(bag)}
-    return find_recorded(runs, "finger path", label)
 
 
 def evaluate_images(bag: Path, count: int) -> DemoResult | None:

@@ -30,8 +30,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array, diags_array, hstack, kron, vstack
 
 from flexsheet.launch.experiments import ExperimentError
-from flexsheet.launch.experiments.demo import read_followed_path
-from flexsheet.launch.experiments.followed import MAX_CONTACT_HEIGHT_M
+from flexsheet.launch.experiments.followed import MAX_CONTACT_HEIGHT_M, read_followed_path
 from flexsheet.launch.experiments.run import (
     Progress,
     make_stroke_procedure,

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from flexsheet.launch.experiments import find_recorded
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     object_pose,
@@ -334,3 +335,14 @@ def read_followed(bag: Path) -> list[dict[str, Any]]:
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
         sheet.add(message, header.source_ns)
     return sheet.summarize_runs()
+
+
+def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
+    """Return the sheet's errors while it followed a finger path, from a bag.
+
+    label: label of the finger path.
+
+    Raises ExperimentError if the bag does not contain the path.
+    """
+    runs = {run["path"]: run for run in read_followed(bag)}
+    return find_recorded(runs, "finger path", label)

@@ -64,7 +64,6 @@ def run_robustness(
     seconds: float,
     workers: int = 1,
     scheduler: str | None = None,
-    keep_bags: bool = False,
     commissioned: bool = False,
 ) -> dict[str, Any]:
     """Evaluate a random laboratory per seed; return the results of `experiment robustness --json`.
@@ -99,7 +98,6 @@ def run_robustness(
             "settings": common["settings"],
             "apparatus": apparatus_text(seed, profile, calibrated=calibrated),
             "seconds": seconds,
-            "bag": str(folder.resolve() / f"{name}.mcap") if keep_bags else None,
             "commission_folder": str(folder.resolve() / f"{name}-lab") if commissioned else None,
         }
     rows = run_sweep(folder, common, trials, progress, workers=workers, scheduler=scheduler)

@@ -99,14 +99,6 @@ def read_flags(bag: Path) -> list[SuspectedCause]:
     return list(found)
 
 
-def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
-    """Simulate one stroke of the finger, and return the measured errors and latencies.
-
-    The trial selects the true parameters of the simulated hardware (the apparatus).
-    """
-    return run_stroke(trial, trial.get("apparatus"))
-
-
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
     """Return the display errors with random true parameters of the simulated hardware.
 
@@ -277,7 +269,6 @@ def run_system_errors_trial(trial: Mapping[str, Any]) -> Row:
 
 
 KINDS: dict[str, Callable[[Mapping[str, Any]], Row]] = {
-    "stroke": run_stroke_trial,
     "robustness": run_robustness_trial,
     "sensitivity": run_sensitivity_trial,
     "system": run_system_trial,
