@@ -3,14 +3,12 @@
 python ros2_peer.py DOMAIN
 
 Its types are written by hand from the public message definitions. It prints each received message
-as a line of JSON, and publishes external inputs that are given as lines of JSON on its standard
-input: {"kind": "eye" or "fingertip", "frame": ..., "at_ns": ..., "xyz": [...], "xyzw": [...]}.
+as a line of JSON.
 """
 
 # No postponed annotations: IdlStruct reads the types of the fields.
 import json
 import sys
-import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +16,7 @@ from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32, uint64
-from cyclonedds.pub import DataWriter
+from cyclonedds.idl.types import float64, int32, sequence, uint8, uint32
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
@@ -57,18 +54,6 @@ class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
     y: float64
     z: float64
     w: float64
-
-
-@dataclass
-class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
-    position: Point
-    orientation: Quaternion
-
-
-@dataclass
-class PoseStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
-    header: Header
-    pose: Pose
 
 
 @dataclass
@@ -116,13 +101,8 @@ class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
 
 
 @dataclass
-class Eye(IdlStruct, typename="flexsheet_msgs::msg::dds_::Eye_"):
-    header: Header
-    writer: str
-    sequence_number: uint64
-    valid: bool
-    centre_world_m: array[float64, 3]
-    right_world: array[float64, 3]
+class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
+    data: str
 
 
 def find_stamp(value: Any) -> int:
@@ -141,9 +121,8 @@ def describe(name: str, message: Any) -> dict[str, Any]:
             return {"frames": [one.child_frame_id for one in message.transforms]}
         case Image():
             return {"size": [message.width, message.height], "data": list(message.data)}
-        case Eye():
-            return {"writer": message.writer, "centre": list(message.centre_world_m),
-                    "right": list(message.right_world)}  # fmt: skip
+        case String():
+            return {"data": message.data}
     raise AssertionError(name)
 
 
@@ -159,27 +138,8 @@ READ = {
     "rt/tf": (TFMessage, RELIABLE),
     "rt/tf_static": (TFMessage, LATCHED),
     "rt/stereo/left/image_raw": (Image, RELIABLE),
-    "rt/flexsheet/eye": (Eye, RELIABLE),
+    "rt/flexsheet/fingertip": (String, RELIABLE),
 }
-
-
-def answer(participant: DomainParticipant) -> None:
-    """Publish the inputs that are given on the standard input."""
-    kinds = {"eye": PoseStamped, "fingertip": PointStamped}
-    writers = {
-        name: DataWriter(participant, Topic(participant, f"rt/external/{name}", kind), RELIABLE)
-        for name, kind in kinds.items()
-    }
-    for line in sys.stdin:
-        given = json.loads(line)
-        seconds, nanoseconds = divmod(given["at_ns"], 10**9)
-        header = Header(Time(seconds, nanoseconds), given["frame"])
-        position = Point(*given["xyz"])
-        if given["kind"] == "eye":
-            message: Any = PoseStamped(header, Pose(position, Quaternion(*given["xyzw"])))
-        else:
-            message = PointStamped(header, position)
-        writers[given["kind"]].write(message)
 
 
 def main() -> None:
@@ -189,7 +149,6 @@ def main() -> None:
         for name, (kind, qos) in READ.items()
     }
     endpoints = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-    threading.Thread(target=answer, args=(participant,), daemon=True).start()
     print(json.dumps({"topic": "ready"}), flush=True)
     while True:
         for one in endpoints.take(N=100):

@@ -9,7 +9,6 @@ from typing import Any, get_args
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from flexsheet.launch.ros2.inputs import INPUTS
 from flexsheet.launch.ros2.mapping import OWN_PREFIX, list_ros_topics
 from flexsheet.messages.base import Header
 from flexsheet.messages.field_types import describe_bounds, describe_field_type
@@ -124,14 +123,5 @@ def render_ros2_topics() -> str:
         for ros_topic, view in list_ros_topics(topic):
             if view is not None:
                 rows.append((f"`{topic.name}`", view.fields, f"`{ros_topic.name}`", view.ros_type))
-    rows.append(("each", "all except images", f"`{OWN_PREFIX}TOPIC`", "flexsheet_msgs/msg/TYPE"))
+    rows.append(("each", "JSON, without images", f"`{OWN_PREFIX}TOPIC`", "std_msgs/msg/String"))
     return format_table(("topic", "fields", "ROS topic", "ROS type"), rows)
-
-
-def render_ros2_inputs() -> str:
-    """Return the table of inputs from ROS 2."""
-    rows = [
-        (f"`{one.ros_topic.name}`", one.ros_topic.ros_type, f"`{one.topic}`", one.about)
-        for one in INPUTS.values()
-    ]
-    return format_table(("ROS topic", "ROS type", "topic", "meaning"), rows)

@@ -49,7 +49,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "mxt-packet": arms_page.render_packet,
     "parameters": parameters_page.render,
     "registers": arms_page.render_registers,
-    "ros2-inputs": messages_page.render_ros2_inputs,
     "ros2-topics": messages_page.render_ros2_topics,
     "scene-keys": messages_page.render_scene,
     "scenes": lambda: scenes.render(RESULTS / "scenes.json"),

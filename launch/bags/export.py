@@ -1,84 +1,47 @@
-"""Export bags as MCAP files with standard schemas, which Foxglove and rerun can open.
+"""Export bags for other tools: MCAP files for Foxglove and Rerun, or bags of ROS 2.
 
-Each topic becomes a JSON channel of the same name. It contains the fields of the topic, except for
-arrays of more than `json_channel.MAX_ARRAY` values. Images and 3D data become separate channels:
-
-    stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
-    tf          poses of the sheet and of both flanges                    foxglove.FrameTransforms
-    finger      the fingertip with its predicted path                     foxglove.SceneUpdate
-    sheet       the sheet between the flanges                             foxglove.SceneUpdate
-    object      the deformed surface of the soft body                     foxglove.SceneUpdate
-
-The axes of the world frame are x to the right, y up, and z towards the user. The timestamps in the
-exported file are the times of recording. They count from 1970 if the bag contains the wall-clock
-time of its start. Otherwise, they count from the time when the recording computer was started.
+`flexsheet.launch.viewing.channels` defines the channels for Foxglove, and
+`flexsheet.launch.ros2.mapping` the topics and types of ROS 2. The timestamps in the exported file
+are the times of recording. They count from 1970 if the bag contains the wall-clock time of its
+start. Otherwise, they count from the time when the recording computer was started.
 """
 
 from __future__ import annotations
 
 import errno
-import json
 import os
+import shutil
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from flexsheet.launch.ros2.mapping import CONTEXT_TOPICS, SHEET_COLOUR, find_sheet_corners
-from flexsheet.launch.viewing.json_channel import make_schema
-from flexsheet.launch.viewing.json_channel import to_json as _plain
+from flexsheet.launch.ros2.mapping import (
+    CONTEXT_TOPICS,
+    Converter,
+    RosTopic,
+    load_ros_types,
+    split_time,
+)
 from flexsheet.messages.bag import BagReader
-from flexsheet.messages.base import Message
+from flexsheet.messages.base import Header, Message
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import free_bytes, make_write_error
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import (
-    ArmState,
-    EStop,
-    Fingertip,
-    Frame,
-    SheetTarget,
-    Side,
-    Skin,
-    SoftBody,
-    StereoPair,
-    TwinEye,
-)
-from flexsheet.nodes.arrays import Floats, Image
-
-try:
-    import foxglove
-    from foxglove import messages as fg
-
-    from flexsheet.launch.viewing.foxglove_drawing import (
-        SKIN_COLOUR,
-        draw_finger,
-        draw_mesh,
-        make_estop_log,
-        make_frame,
-        make_stamp,
-    )
-except ImportError:
-    HAS_FOXGLOVE = False
-else:
-    HAS_FOXGLOVE = True
-
-FINGER_RADIUS_M = 0.007
-
-NamedImage = tuple[str, Image]
-Output = tuple[str, Any]
-
 
 MIN_FREE_BYTES = 4 << 20
 """The minimum free disk space (bytes) during an export.
 
 It exceeds the size of the write buffer of the Foxglove library.
 """
+
+MESH_PERIOD_NS = 100_000_000
+"""The minimum time (ns) between two exported meshes of a channel, which limits the file size."""
+
+METADATA_VERSION = 8
+"""The format version of metadata.yaml, which ROS 2 Humble and later releases can read."""
 
 
 class ExportError(FlexsheetError, RuntimeError):
@@ -96,96 +59,28 @@ class ExportResult:
     """
 
     output: Path
-    messages: dict[str, int] = field(default_factory=dict)
-    unreadable: tuple[str, ...] = ()
+    messages: dict[str, int]
+    unreadable: tuple[str, ...]
 
 
 def export(
     bag: Path,
     output: Path,
+    form: Literal["foxglove", "ros2"] = "foxglove",
     *,
     topics: Iterable[str] | None = None,
     progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
 ) -> ExportResult:
-    """Export a bag as an MCAP file with the schemas of Foxglove.
+    """Export a bag. Topics whose message type has changed since the recording are omitted.
 
-    Topics whose message type cannot be converted to the current version are omitted. The result
-    contains their names.
-
+    output: MCAP file to write, or for ROS 2 the folder of a bag. If the name of the folder ends
+        with .mcap, only the MCAP file is written.
     topics: names of the topics to export, or None for all topics.
     progress: function that is called with the duration exported so far and the total duration (s).
 
-    Raises ExportError if the export fails, and BagError if the bag cannot be read.
+    Raises ExportError or Ros2Error if the export fails, and BagError if the bag cannot be read.
     """
-    if not HAS_FOXGLOVE:
-        raise ExportError(
-            "`bag export` needs the package foxglove-sdk; run: pip install 'flexsheet[export]'"
-        )
-    selection = select_topics(bag, output, topics)
-    offset_ns = wall_clock_offset_ns(selection.reader)
-    result = ExportResult(output, unreadable=selection.unreadable)
-    context = foxglove.Context()
-    channels: dict[str, Any] = {}
-    draft = output.with_name(f"{output.name}.part")
-    state = ViewState()
-    try:
-        check_free_space(output)
-        with foxglove.open_mcap(draft, context=context, allow_overwrite=True) as writer:
-            for number, (topic, message, _, log_time_ns) in enumerate(
-                BagReader(bag, selection.readable)
-            ):
-                # On a full disk, the library would print a line for each message.
-                check_free_space(output)
-                at_ns = log_time_ns + (offset_ns or 0)
-                views = state.views(topic, message, at_ns)
-                for name, value in ((topic, _plain(message)), *views):
-                    channel = channels.get(name) or _channel(name, value, context)
-                    channels[name] = channel
-                    channel.log(value, log_time=at_ns)
-                    result.messages[name] = result.messages.get(name, 0) + 1
-                if number % 200 == 0:
-                    progress((log_time_ns - selection.start_ns) * 1e-9, selection.duration_s)
-            complete = str(selection.reader.complete)
-            writer.write_metadata("flexsheet", {"bag": bag.name, "complete": complete})
-        draft.replace(output)
-    except OSError as error:
-        raise ExportError(str(make_write_error(output, error))) from error
-    except RuntimeError as error:
-        raise ExportError(f"{output}: cannot be written: {error}") from error
-    finally:
-        draft.unlink(missing_ok=True)
-    return result
-
-
-@dataclass(frozen=True, slots=True)
-class TopicsToExport:
-    """The bag to export, its start time and duration, and the names of the topics to export.
-
-    readable: names of the topics to export.
-    context: names of further topics whose messages are needed to draw the exported topics.
-    unreadable: names of the requested topics whose messages cannot be decoded.
-    clock_id: clock of the recorder; None if it is unknown.
-    """
-
-    reader: BagReader
-    start_ns: int
-    duration_s: float
-    readable: tuple[str, ...]
-    context: tuple[str, ...]
-    unreadable: tuple[str, ...]
-    clock_id: str | None
-
-
-def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) -> TopicsToExport:
-    """Select the topics of a bag that can be exported.
-
-    output: file to write, which must not exist; None if no file is written.
-    topics: names of the requested topics, or None for all topics of the bag.
-
-    Raises ExportError if `output` exists or if the bag does not contain a requested topic. Raises
-    BagError if the bag cannot be read.
-    """
-    if output is not None and output.exists():
+    if output.exists():
         raise ExportError(f"{output}: the file exists already; give the name of a new file")
     reader = BagReader(bag)
     summary = reader.info()
@@ -195,89 +90,142 @@ def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) 
         raise ExportError(
             f"{bag}: the bag does not contain the topics {', '.join(absent)}; it contains {names}"
         )
-    all_readable = {one.name for one in summary.topics if one.readable}
-    readable = all_readable & wanted
-    return TopicsToExport(
-        reader,
-        summary.start_ns,
-        summary.duration_s,
-        tuple(sorted(readable)),
-        tuple(sorted(CONTEXT_TOPICS & all_readable - readable)),
-        tuple(sorted(wanted - readable)),
-        summary.metadata.get("recording", {}).get("clock_id"),
-    )
+    readable = {one.name for one in summary.topics if one.readable}
+    selected = readable & wanted
+    draft = output.with_name(f"{output.name}.part")
+    counts: Counter[str] = Counter()
+    try:
+        shutil.rmtree(draft, ignore_errors=True)
+        _check_free_space(output)
+        target = _FoxgloveFile(draft, reader) if form == "foxglove" else _Ros2Bag(draft, reader)
+        try:
+            for number, (topic, message, header, log_ns) in enumerate(
+                BagReader(bag, selected | (CONTEXT_TOPICS & readable))
+            ):
+                # On a full disk, the Foxglove library would print a line for each message.
+                _check_free_space(output)
+                counts.update(target.write(topic, message, header, log_ns, topic in selected))
+                if number % 200 == 0:
+                    progress((log_ns - summary.start_ns) * 1e-9, summary.duration_s)
+        finally:
+            made = target.close()
+        (made / f"{made.name}.mcap" if made.is_dir() and output.suffix == ".mcap" else made).rename(
+            output
+        )
+    except FlexsheetError:
+        raise
+    except OSError as error:
+        raise ExportError(str(make_write_error(output, error))) from error
+    except RuntimeError as error:
+        raise ExportError(f"{output}: cannot be written: {error}") from error
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.unlink(missing_ok=True)
+    return ExportResult(output, dict(counts), tuple(sorted(wanted - readable)))
 
 
-def check_free_space(output: Path) -> None:
+class _FoxgloveFile:
+    """An MCAP file with the channels of Foxglove."""
+
+    def __init__(self, draft: Path, reader: BagReader) -> None:
+        try:
+            import foxglove
+
+            from flexsheet.launch.viewing import channels
+        except ImportError as error:
+            raise ExportError(
+                "`bag export` needs the package foxglove-sdk; run: pip install 'flexsheet[view]'"
+            ) from error
+        self._library, self._draft = channels, draft
+        self._state = channels.ViewState()
+        self._context = foxglove.Context()
+        self._writer = foxglove.open_mcap(draft, context=self._context, allow_overwrite=True)
+        self._writer.write_metadata("flexsheet", {"bag": reader.path.name})
+        self._offset_ns = wall_clock_offset_ns(reader) or 0
+        self._opened: dict[str, Any] = {}
+        self._due_ns: dict[tuple[str, str], int] = {}
+        self._channels: dict[str, list[channels.Channel]] = {}
+        for channel in channels.list_channels(
+            [TOPICS[name] for name in reader.topics if name in TOPICS]
+        ):
+            for topic in channel.triggers:
+                self._channels.setdefault(topic, []).append(channel)
+
+    def write(
+        self, topic: str, message: Message, _: Header, log_ns: int, wanted: bool
+    ) -> Iterator[str]:
+        """Write a message, and yield the names of the channels. Only store it if not wanted."""
+        self._state.update(topic, message)
+        at_ns = log_ns + self._offset_ns
+        stamp = self._library.make_stamp(at_ns)
+        for channel in self._channels[topic] if wanted else ():
+            if at_ns < self._due_ns.get((channel.name, topic), 0):
+                continue
+            value = channel.make(self._state, message, stamp)
+            if value is None:
+                continue
+            if channel.name not in self._opened:
+                self._opened[channel.name] = self._library.open_channel(channel, self._context)
+            self._opened[channel.name].log(value, log_time=at_ns)
+            if channel.pace is self._library.Pace.IMAGES and channel.kind == "SceneUpdate":
+                self._due_ns[channel.name, topic] = at_ns + MESH_PERIOD_NS
+            yield channel.name
+
+    def close(self) -> Path:
+        self._writer.close()
+        return self._draft
+
+
+class _Ros2Bag:
+    """A bag of ROS 2: a folder with metadata.yaml and an MCAP file with messages in CDR."""
+
+    def __init__(self, draft: Path, reader: BagReader) -> None:
+        self._ros = load_ros_types()
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        draft.mkdir()
+        self._folder = draft / draft.stem
+        self._writer = Writer(
+            self._folder, version=METADATA_VERSION, storage_plugin=StoragePlugin.MCAP
+        )
+        self._writer.open()
+        self._converter = Converter(self._ros)
+        self._connections: dict[str, Any] = {}
+        self._clock_id = reader.metadata.get("recording", {}).get("clock_id")
+        self._offset_ns = wall_clock_offset_ns(reader) or 0
+
+    def write(
+        self, topic: str, message: Message, header: Header, log_ns: int, wanted: bool
+    ) -> Iterator[str]:
+        """Write a message, and yield the names of the ROS topics. Only store it if not wanted."""
+        at_ns = log_ns + self._offset_ns
+        split_time(at_ns)
+        # The delay between publication and recording is negligible.
+        same_clock = header.clock_id == self._clock_id
+        shift_ns = self._offset_ns if same_clock else at_ns - header.publish_ns
+        for ros_topic, made in self._converter.convert(topic, message, header, shift_ns):
+            if not wanted:
+                continue
+            if ros_topic.name not in self._connections:
+                self._connections[ros_topic.name] = self._writer.add_connection(
+                    ros_topic.name,
+                    ros_topic.ros_type,
+                    typestore=self._ros.store,
+                    offered_qos_profiles=[make_qos(ros_topic)],
+                )
+            cdr = self._ros.encode(ros_topic.ros_type, made)
+            self._writer.write(self._connections[ros_topic.name], at_ns, cdr)
+            yield ros_topic.name
+
+    def close(self) -> Path:
+        self._writer.close()
+        return self._folder
+
+
+def _check_free_space(output: Path) -> None:
     """Raise OSError if the disk on which the output file will be written is nearly full."""
     if free_bytes(output.parent) < MIN_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-@dataclass(slots=True)
-class ViewState:
-    """The newest scene, soft-body surface and flange poses, needed to draw later messages."""
-
-    scene: Scene | None = None
-    skin: Skin | None = None
-    flanges: dict[Side, Floats] = field(default_factory=dict)
-
-    def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
-        """Yield the images and the 3D data in a message as (channel, Foxglove message).
-
-        at_ns: timestamp of the Foxglove messages.
-        """
-        stamp = make_stamp(at_ns)
-        match message:
-            case Scene():
-                self.scene = message
-            case Skin():
-                self.skin = message
-                yield "object", self._object(message.vertices_world_m, stamp)
-            case SoftBody() if self.skin is not None and self.skin.mesh_id == message.mesh_id:
-                deformed = self.skin.vertices_world_m + message.displacement_world_m
-                yield "object", self._object(deformed, stamp)
-            case Fingertip():
-                radius_m = self.scene.finger.radius_m if self.scene else FINGER_RADIUS_M
-                yield "finger", draw_finger(message, radius_m, stamp)
-            case SheetTarget():
-                yield "tf", _frames("sheet_target", message.world_from_sheet, stamp)
-            case ArmState():
-                self.flanges[message.side] = message.world_from_flange
-                yield "tf", _frames(f"flange_{message.side}", message.world_from_flange, stamp)
-                sheet = self._sheet(stamp)
-                if sheet is not None:
-                    yield "sheet", sheet
-            case EStop():
-                yield "log", make_estop_log(message, stamp, topic)
-        for name, image in list_images(topic, message):
-            yield name, _raw_image(name, image, stamp)
-
-    def _object(self, vertices: NDArray[Any], stamp: Any) -> Any:
-        assert self.skin is not None
-        return draw_mesh("object", vertices, self.skin.triangles, stamp, SKIN_COLOUR)
-
-    def _sheet(self, stamp: Any) -> Any | None:
-        """Draw the sheet as a flat surface; return None if the pose of an edge is unknown."""
-        corners = find_sheet_corners(self.scene, self.flanges)
-        if corners is None:
-            return None
-        triangles = np.array([[0, 2, 1], [1, 2, 3]])
-        return draw_mesh("sheet", corners, triangles, stamp, SHEET_COLOUR)
-
-
-def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
-    """Yield each image in a message, together with the name of the channel for the image."""
-    match message:
-        case StereoPair():
-            yield f"{topic}/left", message.left
-            yield f"{topic}/right", message.right
-        case Frame():
-            for image in message.pixels:
-                yield f"{topic}/image", image
-        case TwinEye():
-            yield f"{topic}/seen", message.seen
-            yield f"{topic}/expected", message.expected
 
 
 def wall_clock_offset_ns(reader: BagReader) -> int | None:
@@ -293,29 +241,30 @@ def wall_clock_offset_ns(reader: BagReader) -> int | None:
         return None
 
 
-def _channel(name: str, value: Any, context: Any) -> Any:
-    if isinstance(value, dict):
-        shape = json.dumps(make_schema(TOPICS[name].message)).encode()
-        schema = foxglove.Schema(name=f"flexsheet.{name}", encoding="jsonschema", data=shape)
-        return foxglove.Channel(name, schema=schema, message_encoding="json", context=context)
-    channel_type = getattr(foxglove.channels, f"{type(value).__name__}Channel")
-    return channel_type(name, context=context)
+def make_qos(topic: RosTopic) -> Any:
+    """Return the ROS 2 quality of service for a topic.
 
+    All topics are reliable. A latched topic is also transient local, so that late subscribers
+    receive its last message.
+    """
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
 
-def _frames(child: str, world_from_child: Floats, stamp: Any) -> Any:
-    frame = make_frame("world", child, world_from_child, stamp)
-    return fg.FrameTransforms(transforms=[frame])
-
-
-def _raw_image(name: str, image: Image, stamp: Any) -> Any:
-    height, width = image.shape[:2]
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    return fg.RawImage(
-        timestamp=stamp,
-        frame_id=name,
-        width=width,
-        height=height,
-        encoding="mono8" if channels == 1 else "rgb8",
-        step=width * channels,
-        data=np.ascontiguousarray(image).tobytes(),
+    unlimited = QosTime(2147483647, 4294967295)
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if topic.latched else 10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if topic.latched else QosDurability.VOLATILE,
+        deadline=unlimited,
+        lifespan=unlimited,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=unlimited,
+        avoid_ros_namespace_conventions=False,
     )

@@ -272,12 +272,10 @@ def export(
             report = recover(bag, output, progress=progress)
         print_result({**asdict(report), "output": str(output)}, as_json=as_json)
         return
-    if form == "ros2":
-        from flexsheet.launch.bags.export_ros2 import export_ros2 as export_bag
-    else:
-        from flexsheet.launch.bags.export import export as export_bag
+    from flexsheet.launch.bags.export import export as export_bag
+
     with progress_bar(f"exporting {bag.name}") as progress:
-        result = export_bag(bag, output, topics=topics, progress=progress)
+        result = export_bag(bag, output, form, topics=topics, progress=progress)
     if result.unreadable:
         listed = ", ".join(result.unreadable)
         words.print(f"not exported: {listed} (recorded with incompatible message types)")

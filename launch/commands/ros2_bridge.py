@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import os
-from enum import StrEnum
-from typing import Annotated, Any
+from collections import Counter
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,42 +13,24 @@ from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.output import CommandError, examples, print_json, words
 
+if TYPE_CHECKING:
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
+    from flexsheet.launch.ros2.dds import RosParticipant
+    from flexsheet.launch.running.runs import Run
+
 app = options.make_app()
-
-
-class ExternalTopic(StrEnum):
-    """The flexsheet topics that ROS nodes may publish if the user permits this."""
-
-    EYE = "eye"
-    FINGERTIP = "fingertip"
 
 
 @app.command(
     epilog=examples(
         "flexsheet ros2-bridge",
         "flexsheet ros2-bridge --topic fingertip --topic arm_left --topic arm_right",
-        "flexsheet ros2-bridge --accept eye --domain 5",
+        "flexsheet ros2-bridge --domain 5",
     )
 )
 def ros2_bridge(
     *,
     topics: options.TopicsOption = None,
-    accept: Annotated[
-        list[ExternalTopic] | None,
-        typer.Option(
-            help="Topic that ROS nodes may publish, as /external/eye or /external/fingertip; can "
-            "be repeated; default: none."
-        ),
-    ] = None,
-    noise_mm: Annotated[
-        float,
-        typer.Option(
-            metavar="MM",
-            min=0.01,
-            max=50.0,
-            help="Standard deviation of external fingertip positions, mm.",
-        ),
-    ] = 1.0,
     domain: Annotated[
         int | None,
         typer.Option(
@@ -63,17 +45,17 @@ def ros2_bridge(
         typer.Option(
             metavar="NAME",
             help="Network interface. DDS has no authentication here: on any interface except lo, "
-            "everyone in that network can read the topics and publish external inputs.",
+            "everyone in that network can read the topics.",
         ),
     ] = "lo",
     duration: options.DurationOption = None,
     run: options.RunOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Publish the topics of the running graph to ROS 2, and accept external inputs.
+    """Publish the topics of the running graph to ROS 2, until Ctrl-C.
 
     RViz can then show the arms, the sheet and the fingertip, and `ros2 bag record` can record them.
-    The bridge never commands the arms. By default it uses the loopback interface.
+    ROS nodes cannot publish in the graph. By default the bridge uses the loopback interface.
     """
     from flexsheet.launch.ros2.bridge import list_default_topics
     from flexsheet.launch.ros2.dds import MAX_DOMAIN, RosParticipant
@@ -97,45 +79,34 @@ def ros2_bridge(
             )
         domain = int(given)
     participant = RosParticipant(domain, interface)
-    settings = {
-        "topics": names,
-        "accept": [one.value for one in accept or ()],
-        "noise_m": noise_mm * 1e-3,
-    }
     words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop")
-    counts: dict[str, Any] = {"published": {}, "accepted": {}, "rejected": {}}
-    work = _run(plan, found, participant, options=settings, duration_s=duration, counts=counts)
-    run_interruptible(work)
+    published: Counter[str] = Counter()
+    run_interruptible(
+        _run(plan, found, participant, names, duration_s=duration, published=published)
+    )
     if as_json:
-        print_json(counts)
+        print_json({"published": published})
         return
-    for what, numbers in counts.items():
-        listed = ", ".join(f"{number} {name}" for name, number in sorted(numbers.items()))
-        words.print(f"{what}: {listed or 'none'}")
+    listed = ", ".join(f"{number} {name}" for name, number in sorted(published.items()))
+    words.print(f"published: {listed or 'none'}")
 
 
 async def _run(
-    plan: Any,
-    run: Any,
-    participant: Any,
+    plan: ResolvedGraph,
+    run: Run,
+    participant: RosParticipant,
+    topics: list[str],
     *,
-    options: dict[str, Any],
     duration_s: float | None,
-    counts: dict[str, Any],
+    published: Counter[str],
 ) -> int:
+    """Bridge a graph for a duration (None: until Ctrl-C); always return 0, the exit code.
+
+    published: counter to which the numbers of messages by ROS topic are added.
+    """
     from flexsheet.launch.ros2.bridge import Ros2Bridge
 
-    try:
-        bridge = Ros2Bridge(
-            plan,
-            run,
-            participant,
-            **options,
-            on_problem=words.print,
-        )
-    except BaseException:
-        participant.close()
-        raise
+    bridge = Ros2Bridge(plan, run, participant, topics=topics, on_problem=words.print)
     try:
         bridge.start()
         async with asyncio.timeout(duration_s):
@@ -144,7 +115,5 @@ async def _run(
         pass
     finally:
         bridge.close()
-        counts["published"] = dict(bridge.published)
-        counts["accepted"] = dict(bridge.accepted)
-        counts["rejected"] = {str(key): value for key, value in bridge.inputs.rejected.items()}
+        published.update(bridge.published)
     return 0

@@ -1,8 +1,7 @@
-"""Bridge a running graph to ROS 2: publish its topics over DDS, and accept external inputs.
+"""Bridge a running graph to ROS 2: publish its topics over DDS.
 
-The bridge has the permissions of a command-line tool. It is allowed to read all topics of the
-graph, and to write the topics that tools are allowed to write. External messages are published in
-the graph under the name of the command-line tools.
+The bridge reads topics of the graph like a command-line tool. ROS nodes cannot publish in the
+graph.
 """
 
 from __future__ import annotations
@@ -15,20 +14,18 @@ from typing import Any
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.ros2.dds import RosParticipant
-from flexsheet.launch.ros2.definitions import Ros2Error
-from flexsheet.launch.ros2.inputs import INPUTS, ExternalInputs
 from flexsheet.launch.ros2.mapping import (
     CONTEXT_TOPICS,
     Converter,
+    Ros2Error,
     list_ros_topics,
     load_ros_types,
 )
 from flexsheet.launch.running.runs import Run
-from flexsheet.launch.running.tools import GraphWriter, make_subscriber
+from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Problem, Subscriber
 from flexsheet.messages.clock import SystemClock
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, find_topic
 
 
@@ -36,9 +33,7 @@ class Ros2Bridge:
     """A bridge between one running graph and one participant of DDS, the middleware of ROS 2.
 
     topics: flexsheet topics to publish.
-    accept: flexsheet topics for which messages of ROS nodes are accepted (keys of `INPUTS`).
-    noise_m: standard deviation of external fingertip positions.
-    published, accepted: numbers of messages by topic.
+    published: number of messages by ROS topic.
     on_problem: function that is called with the text of an error.
     """
 
@@ -49,20 +44,14 @@ class Ros2Bridge:
         participant: RosParticipant,
         *,
         topics: Collection[str],
-        accept: Collection[str] = (),
-        noise_m: float,
         on_problem: Problem,
     ) -> None:
         self.published: Counter[str] = Counter()
-        self.accepted: Counter[str] = Counter()
-        self.inputs = ExternalInputs(noise_m)
         self._participant, self._on_problem = participant, on_problem
         self._ros = load_ros_types()
         self._converter = Converter(self._ros)
         self._clock = SystemClock()
         self._topics = frozenset(topics)
-        self._writer = GraphWriter(plan, run, accept) if accept else None
-        self._accept = tuple(accept)
         for name in topics:
             for ros_topic, _ in list_ros_topics(TOPICS[name]):
                 participant.advertise(ros_topic)
@@ -73,22 +62,16 @@ class Ros2Bridge:
         ]
 
     def start(self) -> None:
-        """Connect to the graph and to ROS. An event loop must be running."""
+        """Connect to the graph. An event loop must be running."""
         for subscriber in self._subscribers:
             subscriber.start()
-        for name in self._accept:
-            self._participant.subscribe(INPUTS[name].ros_topic, partial(self._on_external, name))
 
     def close(self) -> None:
         for subscriber in self._subscribers:
             subscriber.close()
         self._participant.close()
-        if self._writer is not None:
-            self._writer.close()
 
     def _on_message(self, topic: str, message: Any, header: Header) -> None:
-        if isinstance(message, Scene):
-            self.inputs.set_scene(message)
         now_ns = self._clock.now_ns()
         shift_ns = time.time_ns() - now_ns
         if header.clock_id != self._clock.id:
@@ -105,17 +88,6 @@ class Ros2Bridge:
                 self._on_problem(str(error))
                 continue
             self.published[ros_topic.name] += 1
-
-    def _on_external(self, topic: str, cdr: bytes) -> None:
-        assert self._writer is not None
-        now_ns = self._clock.now_ns()
-        decode = partial(self._ros.decode, INPUTS[topic].ros_topic.ros_type, cdr)
-        converted = self.inputs.convert(topic, decode, now_ns, time.time_ns())
-        if converted is None:
-            return
-        message, source_ns = converted
-        self._writer.publish(topic, message, source_ns=source_ns)
-        self.accepted[topic] += 1
 
 
 def list_default_topics(plan: ResolvedGraph) -> list[str]:

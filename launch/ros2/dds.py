@@ -1,4 +1,4 @@
-"""Publish and subscribe to ROS 2 topics with the middleware Cyclone DDS.
+"""Publish ROS 2 topics with the middleware Cyclone DDS.
 
 ROS 2 maps the topic `/a` to the DDS topic `rt/a`, and the type `p/msg/T` to `p::msg::dds_::T_`.
 `mapping.RosTypes` serializes messages to CDR, and Cyclone DDS only transports the bytes.
@@ -6,28 +6,21 @@ ROS 2 maps the topic `/a` to the DDS topic `rt/a`, and the type `p/msg/T` to `p:
 
 from __future__ import annotations
 
-import asyncio
 import re
-import threading
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
 import psutil
 
-from flexsheet.launch.ros2.definitions import Ros2Error
-from flexsheet.launch.ros2.mapping import RosTopic, load_ros_types
+from flexsheet.launch.ros2.mapping import Ros2Error, RosTopic, load_ros_types
 
 LOOPBACK = "lo"
 MAX_DOMAIN = 232
 MAX_PARTICIPANTS = 120
 """The maximum number of DDS participants that can find each other if multicast is disabled."""
 
-WAIT_S = 0.2
 BLOCKING_S = 0.1
-MAX_SAMPLES = 100
 _ARRAY_LIMIT = 65535
 
 
@@ -66,14 +59,6 @@ def make_configuration(interface: str) -> str:
     )
 
 
-@dataclass(slots=True)
-class Sample:
-    """A received message as CDR bytes (the serialization format of DDS)."""
-
-    cdr: bytes
-    sample_info: Any = None
-
-
 @cache
 def make_dds_type(ros_type: str) -> Any:
     """Make a Cyclone DDS type for a ROS type.
@@ -86,11 +71,7 @@ def make_dds_type(ros_type: str) -> Any:
         cdr: bytes = self.cdr
         return cdr
 
-    def deserialize(_: Any, /, data: bytes, **__: Any) -> Sample:
-        return Sample(bytes(data))
-
     described.serialize = serialize
-    described.deserialize = classmethod(deserialize)
     return described
 
 
@@ -118,7 +99,7 @@ def _describe(ros_type: str) -> Any:
 
 
 class RosParticipant:
-    """A participant of a DDS domain that publishes and subscribes to ROS topics.
+    """A participant of a DDS domain that publishes ROS topics.
 
     domain: number of the domain, equal to the ROS_DOMAIN_ID of the other participants.
     interface: name of the network interface.
@@ -129,7 +110,7 @@ class RosParticipant:
     def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
         if find_spec("cyclonedds") is None:
             raise Ros2Error("the bridge needs cyclonedds; run: pip install 'flexsheet[ros2]'")
-        from cyclonedds.core import DDSException, WaitSet
+        from cyclonedds.core import DDSException
         from cyclonedds.domain import Domain, DomainParticipant
 
         configuration = make_configuration(interface)
@@ -141,10 +122,6 @@ class RosParticipant:
                 f"the DDS domain {domain} on {interface} cannot be joined: {error}; check --domain"
             ) from error
         self._writers: dict[str, Any] = {}
-        self._readers: list[tuple[Any, Callable[[bytes], None]]] = []
-        self._waiting = WaitSet(self._participant)
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def advertise(self, topic: RosTopic) -> None:
         """Create the DDS writer of a topic, so that other participants discover the topic."""
@@ -173,49 +150,14 @@ class RosParticipant:
                 f"ROS topic {topic.name}: a message cannot be published: {error}"
             ) from error
 
-    def subscribe(self, topic: RosTopic, on_message: Callable[[bytes], None]) -> None:
-        """Subscribe to a topic.
-
-        on_message: function that is called in the running event loop with the CDR bytes of each
-            message.
-        """
-        from cyclonedds.core import InstanceState as State
-        from cyclonedds.core import ReadCondition, SampleState, ViewState
-        from cyclonedds.sub import DataReader
-
-        reader = DataReader(self._participant, self._make_topic(topic), qos=_make_qos(topic))
-        condition = ReadCondition(reader, ViewState.Any | State.Any | SampleState.NotRead)
-        self._waiting.attach(condition)
-        self._readers.append((reader, on_message))
-        if self._thread is None:
-            loop = asyncio.get_running_loop()
-            self._thread = threading.Thread(
-                target=self._read, args=(loop,), name="ros2", daemon=True
-            )
-            self._thread.start()
-
     def close(self) -> None:
-        self._closing.set()
-        if self._thread is not None:
-            self._thread.join()
-        self._readers.clear()
         self._writers.clear()
-        del self._waiting, self._participant, self._domain
+        del self._participant, self._domain
 
     def _make_topic(self, topic: RosTopic) -> Any:
         from cyclonedds.topic import Topic
 
         return Topic(self._participant, mangle_topic(topic.name), make_dds_type(topic.ros_type))
-
-    def _read(self, loop: asyncio.AbstractEventLoop) -> None:
-        from cyclonedds.util import duration
-
-        while not self._closing.is_set():
-            self._waiting.wait(duration(milliseconds=round(WAIT_S * 1e3)))
-            for reader, on_message in tuple(self._readers):
-                for sample in reader.take(N=MAX_SAMPLES):
-                    if isinstance(sample, Sample) and not self._closing.is_set():
-                        loop.call_soon_threadsafe(on_message, sample.cdr)
 
 
 def _make_qos(topic: RosTopic) -> Any:

@@ -1,8 +1,7 @@
 """Map topics of flexsheet to topics of ROS 2, for exported bags and for the live bridge.
 
-`VIEWS` lists the ROS topics with standard types. In addition, each topic is published as
-`flexsheet/TOPIC` with all fields except images. The module `definitions` generates the types of
-these messages.
+`VIEWS` lists the ROS topics with types for the usual tools. In addition, each topic is published as
+`flexsheet/TOPIC`, a std_msgs/String with the fields as JSON, without arrays of over 64 values.
 
 The frame `world` has the following child frames: `object`, `camera_left`, `camera_right`,
 `projector`, `left_base`, `right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`,
@@ -12,38 +11,31 @@ flanges from joint angles.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
-from flexsheet.launch.ros2.definitions import (
-    Ros2Error,
-    convert_fields,
-    make_definitions,
-    ros_name,
-    split_time,
-)
+from flexsheet.launch.viewing.json_channel import to_json
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock_table import shift_stamps
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, Scene
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import (
     ArmState,
     EStop,
-    Eye,
     Fingertip,
-    Force,
     Frame,
     SheetTarget,
     Side,
     Skin,
     SoftBody,
     StereoPair,
-    TwinArms,
     TwinEye,
     TwinFinger,
 )
@@ -59,16 +51,35 @@ from flexsheet.nodes.models.rigid import (
 OWN_PREFIX = "/flexsheet/"
 WORLD = "world"
 JOINTS = 6
-CONTEXT_TOPICS = frozenset({"scene", "skin", "arm_left", "arm_right"})
+CONTEXT_TOPICS = frozenset({"scene", "skin"})
 """The topics whose latest messages are needed to convert messages of other topics."""
 
-SHEET_COLOUR = (0.97, 0.93, 0.84, 0.45)
-_TRIANGLE_LIST = 11
+OWN_TYPE = "std_msgs/msg/String"
 _FLOAT32 = 7
 
 
+class Ros2Error(FlexsheetError, RuntimeError):
+    """Raised if messages cannot be exchanged with ROS 2."""
+
+    remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
+
+
+def split_time(at_ns: int) -> dict[str, int]:
+    """Split a time (ns since 1970) into the fields of a ROS time.
+
+    Raises Ros2Error if the time is before 1970 or after 2038, because ROS 2 cannot represent it.
+    """
+    seconds, nanoseconds = divmod(at_ns, 1_000_000_000)
+    if not 0 <= seconds < 1 << 31:
+        raise Ros2Error(
+            f"the timestamp {at_ns} ns is outside the range of ROS 2 (1970 to 2038); "
+            "check the bag with `flexsheet bag info`"
+        )
+    return {"sec": seconds, "nanosec": nanoseconds}
+
+
 class RosTypes:
-    """A codec for ROS 2 messages in the CDR format, including the messages of flexsheet.
+    """A codec for ROS 2 messages in the CDR format.
 
     Raises Ros2Error if the package rosbags is not installed.
     """
@@ -76,14 +87,10 @@ class RosTypes:
     def __init__(self) -> None:
         if find_spec("rosbags") is None:
             raise Ros2Error("ROS 2 messages need rosbags; run: pip install 'flexsheet[ros2]'")
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from rosbags.typesys import Stores, get_typestore
 
         # Humble and later releases have the same definitions of these types.
         self.store = get_typestore(Stores.ROS2_JAZZY)
-        own: dict[str, Any] = {}
-        for name, text in make_definitions({topic.message for topic in TOPICS.values()}).items():
-            own.update(get_types_from_msg(text, name))
-        self.store.register(own)
 
     def make(self, kind: str, /, **fields: Any) -> Any:
         """Make a ROS message of the type `kind`, such as `std_msgs/msg/Bool`."""
@@ -92,10 +99,6 @@ class RosTypes:
     def encode(self, name: str, message: Any) -> bytes:
         """Serialize a message to CDR bytes, including the encapsulation header of four bytes."""
         return bytes(self.store.serialize_cdr(message, name))
-
-    def decode(self, name: str, data: bytes) -> Any:
-        """Deserialize a message of the type `name` from CDR bytes."""
-        return self.store.deserialize_cdr(data, name)
 
     def stamp(self, at_ns: int) -> Any:
         return self.make("builtin_interfaces/msg/Time", **split_time(at_ns))
@@ -118,10 +121,6 @@ class RosTypes:
             orientation=self.quaternion(matrix[:3, :3]),
         )
 
-    def duration(self) -> Any:
-        """Make a ROS duration of zero."""
-        return self.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-
 
 @cache
 def load_ros_types() -> RosTypes:
@@ -137,7 +136,6 @@ class Source:
     at_ns: source timestamp of the message, ns since 1970.
     scene, skin: latest messages with the scene and the surface of the soft body. They are None
         before the first message.
-    flanges: latest flange poses (4, 4) by side.
     """
 
     ros: RosTypes
@@ -145,7 +143,6 @@ class Source:
     at_ns: int
     scene: Scene | None
     skin: Skin | None
-    flanges: dict[Side, Floats]
 
     def stamped(self, kind: str, name: str, value: Any, frame: str = WORLD) -> Any:
         """Make a ROS message that consists of a header and one other field.
@@ -286,20 +283,11 @@ def _pose(source: Source, matrix: Floats) -> Any:
     return source.stamped("geometry_msgs/msg/PoseStamped", "pose", source.ros.pose(matrix))
 
 
-def _twist(source: Source, linear: Any, angular: Any = (0.0, 0.0, 0.0)) -> Any:
+def _force(body: SoftBody, source: Source) -> Any:
     ros = source.ros
-    twist = ros.make("geometry_msgs/msg/Twist", linear=ros.xyz(linear), angular=ros.xyz(angular))
-    return source.stamped("geometry_msgs/msg/TwistStamped", "twist", twist)
-
-
-def _wrench(source: Source, force: Any, frame: str = WORLD) -> Any:
-    ros = source.ros
-    wrench = ros.make("geometry_msgs/msg/Wrench", force=ros.xyz(force), torque=ros.xyz(np.zeros(3)))
-    return source.stamped("geometry_msgs/msg/WrenchStamped", "wrench", wrench, frame)
-
-
-def _measured_force(force: Force, source: Source) -> Any | None:
-    return _wrench(source, [0.0, 0.0, -force.force_n], "sheet") if force.valid else None
+    force = ros.xyz(body.force_world_n)
+    wrench = ros.make("geometry_msgs/msg/Wrench", force=force, torque=ros.xyz(np.zeros(3)))
+    return source.stamped("geometry_msgs/msg/WrenchStamped", "wrench", wrench)
 
 
 def list_joints(side: str) -> list[str]:
@@ -307,71 +295,21 @@ def list_joints(side: str) -> list[str]:
     return [f"{side}_joint_{number}" for number in range(1, JOINTS + 1)]
 
 
-def _joint_states(source: Source, joints_rad: dict[str, Floats]) -> Any:
+def _joint_states(arm: ArmState, source: Source) -> Any:
     return source.ros.make(
         "sensor_msgs/msg/JointState",
         header=source.ros.header(source.at_ns, ""),
-        name=[name for side in joints_rad for name in list_joints(side)],
-        position=np.concatenate(list(joints_rad.values())),
+        name=list_joints(arm.side),
+        position=arm.joints_rad,
         velocity=np.zeros(0),
         effort=np.zeros(0),
     )
-
-
-def _joint_command(arm: ArmState, source: Source) -> Any | None:
-    if not arm.command_sent_ns:
-        return None
-    ros, none = source.ros, np.zeros(0)
-    point = ros.make(
-        "trajectory_msgs/msg/JointTrajectoryPoint",
-        positions=arm.joints_commanded_rad,
-        velocities=none,
-        accelerations=none,
-        effort=none,
-        time_from_start=ros.duration(),
-    )
-    return ros.make(
-        "trajectory_msgs/msg/JointTrajectory",
-        header=ros.header(arm.command_sent_ns, ""),
-        joint_names=list_joints(arm.side),
-        points=[point],
-    )
-
-
-def _predicted_path(fingertip: Fingertip, source: Source) -> Any | None:
-    if not fingertip.valid:
-        return None
-    step_ns = round(fingertip.prediction_step_s * 1e9)
-    poses = [
-        source.ros.make(
-            "geometry_msgs/msg/PoseStamped",
-            header=source.ros.header(source.at_ns + number * step_ns),
-            pose=source.ros.pose(transform(np.eye(3), position)),
-        )
-        for number, position in enumerate(fingertip.predicted_path_world_m)
-    ]
-    return source.stamped("nav_msgs/msg/Path", "poses", poses)
 
 
 def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
     if not fingertip.valid:
         return None
     return _frames(source, {"fingertip": transform(np.eye(3), fingertip.position_world_m)})
-
-
-def _eye_pose(eye: Eye, source: Source) -> Any | None:
-    """Return the pose of the midpoint of the eyes, or None if the eye positions are not valid.
-
-    The x axis of the pose points from the left to the right eye.
-    """
-    if not eye.valid:
-        return None
-    x_axis = eye.right_world / np.linalg.norm(eye.right_world)
-    helper = np.eye(3)[1 if abs(x_axis[1]) < 0.9 else 2]
-    z_axis = np.cross(x_axis, helper)
-    z_axis /= np.linalg.norm(z_axis)
-    rotation = np.column_stack([x_axis, np.cross(z_axis, x_axis), z_axis])
-    return _pose(source, transform(rotation, eye.centre_world_m))
 
 
 def _points(source: Source, points: Singles) -> Any:
@@ -400,62 +338,8 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
     return _points(source, source.skin.vertices_world_m + body.displacement_world_m)
 
 
-def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
-    """Return the corners (4, 3), in m, of a flat sheet between both clamped edges.
-
-    The order of the corners is lower left, upper left, lower right, upper right.
-
-    flanges: flange pose (4, 4) of each arm, by side.
-
-    Returns None if the scene or an arm is unknown.
-    """
-    if scene is None or len(flanges) < 2:
-        return None
-    half_m = 0.5 * scene.sheet.height_m
-    corners = []
-    for side, spec in (("left", scene.arms.left), ("right", scene.arms.right)):
-        world_from_edge = flanges[side] @ pose_matrix(spec.flange_from_edge)  # type: ignore[index]
-        corners += [(world_from_edge @ [0.0, y_m, 0.0, 1.0])[:3] for y_m in (-half_m, half_m)]
-    return np.array(corners)
-
-
-def _sheet_marker(_: ArmState, source: Source) -> Any | None:
-    corners = find_sheet_corners(source.scene, source.flanges)
-    if corners is None:
-        return None
-    ros = source.ros
-    red, green, blue, alpha = SHEET_COLOUR
-    no_bytes = np.zeros(0, np.uint8)
-    return ros.make(
-        "visualization_msgs/msg/Marker",
-        header=ros.header(source.at_ns),
-        ns="sheet",
-        id=0,
-        type=_TRIANGLE_LIST,
-        action=0,
-        pose=ros.pose(np.eye(4)),
-        scale=ros.xyz((1.0, 1.0, 1.0)),
-        color=ros.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
-        lifetime=ros.duration(),
-        frame_locked=False,
-        points=[ros.xyz(corners[i], "Point") for i in (0, 2, 1, 1, 2, 3)],
-        colors=[],
-        texture_resource="",
-        texture=ros.make(
-            "sensor_msgs/msg/CompressedImage", header=ros.header(0, ""), format="", data=no_bytes
-        ),
-        uv_coordinates=[],
-        text="",
-        mesh_resource="",
-        mesh_file=ros.make("visualization_msgs/msg/MeshFile", filename="", data=no_bytes),
-        mesh_use_embedded_materials=False,
-    )
-
-
-_POINT, _POSE = "geometry_msgs/msg/PointStamped", "geometry_msgs/msg/PoseStamped"
-_TWIST, _WRENCH = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/WrenchStamped"
 _IMAGE, _TF = "sensor_msgs/msg/Image", "tf2_msgs/msg/TFMessage"
-_JOINTS, _CLOUD = "sensor_msgs/msg/JointState", "sensor_msgs/msg/PointCloud2"
+_POINT, _CLOUD = "geometry_msgs/msg/PointStamped", "sensor_msgs/msg/PointCloud2"
 
 VIEWS = (
     View(Scene, "poses of camera, projector, arms, object", "tf_static", _TF, _static_frames,
@@ -470,49 +354,26 @@ VIEWS = (
          "sensor_msgs/msg/CameraInfo", _camera_info("right")),
     View(Fingertip, "position_world_m", "{topic}/point", _POINT,
          lambda tip, source: _point(source, tip.position_world_m) if tip.valid else None),
-    View(Fingertip, "velocity_world_m_per_s", "{topic}/velocity", _TWIST,
-         lambda tip, source: _twist(source, tip.velocity_world_m_per_s) if tip.valid else None),
-    View(Fingertip, "predicted_path_world_m", "{topic}/predicted_path", "nav_msgs/msg/Path",
-         _predicted_path),
     View(Fingertip, "position_world_m", "tf", _TF, _fingertip_frame),
-    View(SheetTarget, "world_from_sheet", "{topic}/pose", _POSE,
+    View(SheetTarget, "world_from_sheet", "{topic}/pose", "geometry_msgs/msg/PoseStamped",
          lambda target, source: _pose(source, target.world_from_sheet)),
-    View(SheetTarget, "twist_world", "{topic}/twist", _TWIST,
-         lambda target, source: _twist(source, target.twist_world[:3], target.twist_world[3:])),
     View(SheetTarget, "world_from_sheet", "tf", _TF,
          lambda target, source: _frames(source, {"sheet": target.world_from_sheet})),
-    View(ArmState, "joints_rad", "joint_states", _JOINTS,
-         lambda arm, source: _joint_states(source, {arm.side: arm.joints_rad})),
-    View(ArmState, "joints_commanded_rad", "{topic}/joint_command",
-         "trajectory_msgs/msg/JointTrajectory", _joint_command),
-    View(ArmState, "world_from_flange", "{topic}/flange", _POSE,
-         lambda arm, source: _pose(source, arm.world_from_flange)),
+    View(ArmState, "joints_rad", "joint_states", "sensor_msgs/msg/JointState", _joint_states),
     View(ArmState, "world_from_flange", "tf", _TF,
          lambda arm, source: _frames(
              source, {f"{arm.side}_flange_measured": arm.world_from_flange})),
-    View(ArmState, "world_from_flange of both arms", "sheet/marker",
-         "visualization_msgs/msg/Marker", _sheet_marker),
     View(Skin, "vertices_world_m", "{topic}/points", _CLOUD,
          lambda skin, source: _points(source, skin.vertices_world_m), latched=True),
     View(SoftBody, "displacement_world_m", "{topic}/points", _CLOUD, _deformed_points),
-    View(SoftBody, "force_world_n", "{topic}/force", _WRENCH,
-         lambda body, source: _wrench(source, body.force_world_n)),
-    View(Force, "force_n", "{topic}/wrench", _WRENCH, _measured_force),
+    View(SoftBody, "force_world_n", "{topic}/force", "geometry_msgs/msg/WrenchStamped", _force),
     View(Frame, "pixels", "{topic}/image", _IMAGE,
          _image(lambda frame: (frame.pixels[0], "projector") if frame.pixels else None)),
-    View(Eye, "centre_world_m, right_world", "{topic}/pose", _POSE, _eye_pose),
     View(EStop, "engaged", "{topic}/engaged", "std_msgs/msg/Bool",
          lambda estop, source: source.ros.make("std_msgs/msg/Bool", data=estop.engaged),
          latched=True),
     View(TwinFinger, "position_world_m", "{topic}/point", _POINT,
          lambda finger, source: _point(source, finger.position_world_m)),
-    View(TwinFinger, "velocity_world_m_per_s", "{topic}/velocity", _TWIST,
-         lambda finger, source: _twist(source, finger.velocity_world_m_per_s)),
-    View(TwinFinger, "force_world_n", "{topic}/force", _WRENCH,
-         lambda finger, source: _wrench(source, finger.force_world_n)),
-    View(TwinArms, "joints_left_rad, joints_right_rad", "{topic}/joint_states", _JOINTS,
-         lambda arms, source: _joint_states(
-             source, {"left": arms.joints_left_rad, "right": arms.joints_right_rad})),
     View(TwinEye, "seen", "{topic}/seen", _IMAGE, _image(lambda eye: (eye.seen, "eye"))),
     View(TwinEye, "expected", "{topic}/expected", _IMAGE,
          _image(lambda eye: (eye.expected, "eye"))),
@@ -524,7 +385,7 @@ def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
     """Return the ROS topics to which the messages of a flexsheet topic are converted.
 
     The first topics have standard ROS types. Each is returned with the `View` that defines its
-    conversion. The last topic has a generated type with all fields, and None instead of a view.
+    conversion. The last topic contains the fields as JSON, and None instead of a view.
     """
     found: list[tuple[RosTopic, View | None]] = [
         (RosTopic("/" + view.name.format(topic=topic.name), view.ros_type, view.latched), view)
@@ -532,7 +393,7 @@ def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
         if view.message is topic.message
     ]
     latched = topic.delivery is Delivery.LATCHED
-    found.append((RosTopic(OWN_PREFIX + topic.name, ros_name(topic.message), latched), None))
+    found.append((RosTopic(OWN_PREFIX + topic.name, OWN_TYPE, latched), None))
     return found
 
 
@@ -540,13 +401,12 @@ def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
 class Converter:
     """A converter of the messages of one graph to ROS 2.
 
-    The latest scene, skin and flange poses are stored, because later conversions need them.
+    The latest scene and skin are stored, because later conversions need them.
     """
 
     ros: RosTypes
     scene: Scene | None = None
     skin: Skin | None = None
-    flanges: dict[Side, Floats] = field(default_factory=dict)
 
     def convert(
         self,
@@ -566,23 +426,17 @@ class Converter:
                 self.scene = message
             case Skin():
                 self.skin = message
-            case ArmState():
-                self.flanges[message.side] = message.world_from_flange
         at_ns = max(0, header.source_ns + shift_ns)
         message = shift_stamps(message, shift_ns)
-        source = Source(self.ros, topic, at_ns, self.scene, self.skin, self.flanges)
+        source = Source(self.ros, topic, at_ns, self.scene, self.skin)
         for ros_topic, view in list_ros_topics(TOPICS[topic]):
             if not wanted(ros_topic):
                 continue
             if view is not None:
                 made = view.make(message, source)
             else:
-                made = self.ros.make(
-                    ros_name(type(message)),
-                    header=self.ros.header(at_ns),
-                    writer=header.writer,
-                    sequence_number=header.sequence,
-                    **convert_fields(message, self.ros.make),
-                )
+                fields = to_json(message)
+                head = {"source_ns": at_ns, "writer": header.writer, "sequence": header.sequence}
+                made = self.ros.make(OWN_TYPE, data=json.dumps({"header": head, **fields}))
             if made is not None:
                 yield ros_topic, made

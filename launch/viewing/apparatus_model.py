@@ -2,13 +2,13 @@
 
 Each arm has the links `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`,
 where SIDE is `left` or `right`. The other links are `world`, `camera_left`, `camera_right`,
-`projector` and `screen`. The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model
+and `projector`. The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model
 contains only geometry, because masses and torques are unknown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import get_args
 
@@ -17,12 +17,9 @@ import numpy as np
 from flexsheet.launch.ros2.mapping import list_joints
 from flexsheet.messages.scene import ClosedFormArm, Projector, Scene
 from flexsheet.messages.types import Side
-from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.joint_chain import UnreachableError
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import BRACKET_WIDTH_M, CLAMP_SIZE_M, make_pieces
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, rotation_from_vector, transform
-from flexsheet.nodes.models.sheet import flange_pose
 
 Vector = tuple[float, float, float]
 Colour = tuple[float, float, float, float]
@@ -31,7 +28,6 @@ WORLD = "world"
 LIGHT: Colour = (0.87, 0.89, 0.91, 1.0)
 DARK: Colour = (0.29, 0.33, 0.41, 1.0)
 LENS: Colour = (0.0, 0.42, 0.58, 1.0)
-SCREEN: Colour = (0.97, 0.93, 0.84, 0.35)
 
 CAMERA_BODY_M: Vector = (0.05, 0.035, 0.045)
 """The size (x, y, z), in metres, of the drawn housing of a camera behind the lens."""
@@ -102,22 +98,11 @@ class ApparatusModel:
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
 
-    def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Floats]:
-        """Return the world poses (4, 4) of all links, by name.
-
-        angles_rad: joint angles by joint name. If an angle is missing, it is zero.
-        """
-        found = {WORLD: np.eye(4)}
-        for joint in self.joints:
-            found[joint.child] = found[joint.parent] @ joint.pose(angles_rad.get(joint.name, 0.0))
-        return found
-
 
 def make_model(scene: Scene) -> ApparatusModel:
-    """Return a model of both arms with clamps, the stereo camera, the projector and the screen.
+    """Return a model of both arms with clamps, the stereo camera and the projector.
 
-    The screen is the unstretched sheet at the origin of the world. The joint angles of the model
-    are equal to the readings of the joint encoders.
+    The joint angles of the model are equal to the readings of the joint encoders.
     """
     links, joints = [Link(WORLD)], []
     for side in get_args(Side):
@@ -128,26 +113,6 @@ def make_model(scene: Scene) -> ApparatusModel:
         joints.append(Joint(f"{name}_mount", WORLD, name, world_from_device))
         links.append(Link(name, boxes))
     return ApparatusModel(scene.name, tuple(links), tuple(joints))
-
-
-def solve_rest_joints(scene: Scene) -> dict[str, float]:
-    """Return the joint angles (rad), by joint name, at which the arms hold the sheet at the screen.
-
-    If an arm cannot reach the screen, each of its joint angles is the centre of the joint's range.
-    """
-    angles: dict[str, float] = {}
-    for side in get_args(Side):
-        geometry = ArmGeometry(scene, side)
-        half_m = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
-        edge = transform(np.eye(3), (-half_m if side == "left" else half_m, 0.0, 0.0))
-        flange = flange_pose(edge, geometry.flange_from_edge)
-        middle = 0.5 * (np.array(geometry.model.min_rad) + np.array(geometry.model.max_rad))
-        try:
-            joints = geometry.solve_joints(flange, middle)
-        except UnreachableError:
-            joints = middle
-        angles |= dict(zip(list_joints(side), joints.tolist(), strict=True))
-    return angles
 
 
 def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
@@ -189,7 +154,7 @@ def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
 
 
 def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]:
-    """Yield the name, world pose (4, 4) and boxes of each camera, the projector and the screen."""
+    """Yield the name, world pose (4, 4) and boxes of each camera and the projector."""
     left = pose_matrix(scene.camera.world_from_left)
     yield "camera_left", left, _make_device(CAMERA_BODY_M, 0.02)
     right = left @ inverse(np.asarray(scene.camera.right_from_left))
@@ -198,9 +163,6 @@ def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]
     if projector is not None:
         pose = pose_matrix(projector.world_from_projector)
         yield "projector", pose, _make_device(PROJECTOR_BODY_M, 0.04)
-    sheet = scene.sheet
-    size_m = (sheet.width_m, sheet.height_m, sheet.thickness_m)
-    yield "screen", np.eye(4), (Box(size_m, (0.0, 0.0, 0.0), SCREEN),)
 
 
 def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:

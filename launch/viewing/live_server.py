@@ -22,12 +22,13 @@ from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.runs import Run
 from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.launch.viewing.apparatus_model import make_model
-from flexsheet.launch.viewing.foxglove_drawing import make_stamp
-from flexsheet.launch.viewing.live_channels import (
-    LiveChannel,
-    LiveState,
+from flexsheet.launch.viewing.channels import (
+    Channel,
     Pace,
+    ViewState,
     list_channels,
+    make_stamp,
+    open_channel,
 )
 from flexsheet.launch.viewing.urdf import make_urdf
 from flexsheet.messages.base import Header, Message
@@ -95,14 +96,14 @@ class LiveServer:
             Pace.EACH: 0,
             Pace.STATIC: 0,
         }
-        self._state = LiveState()
+        self._state = ViewState()
         self._subscribers: dict[str, Subscriber] = {}
         self._clock = SystemClock()
         self._epoch_ns = time.time_ns() - self._clock.now_ns()
         self._context = foxglove.Context()
         topics = [find_topic(name) for name in plan.writers]
         self.channels = list(list_channels(topics))
-        self._sinks = {one.name: self._open(one) for one in self.channels}
+        self._sinks = {one.name: open_channel(one, self._context) for one in self.channels}
         self._due_ns: dict[tuple[str, str], int] = {}
         self._parameters = ReadOnlyParameters()
         self._server = foxglove.start_server(
@@ -147,19 +148,6 @@ class LiveServer:
             subscriber.close()
         self._server.stop()
 
-    def _open(self, channel: LiveChannel) -> Any:
-        if channel.schema is None:
-            kind = getattr(foxglove.channels, f"{channel.kind}Channel")
-            return kind(channel.name, context=self._context)
-        schema = foxglove.Schema(
-            name=f"flexsheet.{channel.schema['title']}",
-            encoding="jsonschema",
-            data=json.dumps(channel.schema).encode(),
-        )
-        return foxglove.Channel(
-            channel.name, schema=schema, message_encoding="json", context=self._context
-        )
-
     async def _every(self, period_s: float, call: Callable[[], None]) -> None:
         while True:
             call()
@@ -188,7 +176,6 @@ class LiveServer:
         self._state.update(topic, message)
         if isinstance(message, Scene):
             self._set_parameters({URDF_PARAMETER: make_urdf(make_model(message))})
-            self._send_static()
         elif isinstance(message, Status):
             changed = json.loads(message.changed_parameters)
             self._set_parameters({f"{message.node}.{key}": one for key, one in changed.items()})
@@ -200,7 +187,7 @@ class LiveServer:
                 self._send(channel, topic, message, now_ns, source_ns)
 
     def _send(
-        self, channel: LiveChannel, topic: str, message: Message | None, now_ns: int, source_ns: int
+        self, channel: Channel, topic: str, message: Message | None, now_ns: int, source_ns: int
     ) -> None:
         """Send a message on a channel if the channel has viewers and its period has elapsed.
 
