@@ -8,7 +8,6 @@ the right, y up, and z towards the user.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -230,10 +229,7 @@ class Appearance(Part):
 
 
 class VirtualObject(Part):
-    """The virtual object that the user touches. An object without a material is rigid.
-
-    In a scene file, `support_angle_rad: x` stands for `support: {kind: strip, angle_rad: x}`.
-    """
+    """The virtual object that the user touches. An object without a material is rigid."""
 
     geometry: Geometry
     material: Material | None = Field(
@@ -255,32 +251,6 @@ class VirtualObject(Part):
                 "add for example support: {kind: strip, angle_rad: 1.57}"
             )
         return self
-
-    @model_validator(mode="before")
-    @classmethod
-    def _convert_support_angle(cls, values: Any) -> Any:
-        if not isinstance(values, Mapping) or "support_angle_rad" not in values:
-            return values
-        if "support" in values:
-            raise ValueError(
-                "support and support_angle_rad are both given; the latter means "
-                "support: {kind: strip, angle_rad: ...}; remove one of them"
-            )
-        rest = {key: value for key, value in values.items() if key != "support_angle_rad"}
-        return rest | {"support": {"kind": "strip", "angle_rad": values["support_angle_rad"]}}
-
-    @property
-    def support_angle_rad(self) -> float:
-        """Return the angle (rad) of a strip support.
-
-        Raises UnfitGeometryError if the object has another kind of support.
-        """
-        if not isinstance(self.support, StripSupport):
-            raise UnfitGeometryError(
-                "object.support.kind of the scene is "
-                f'"{None if self.support is None else self.support.kind}", expected "strip"'
-            )
-        return self.support.angle_rad
 
 
 class SheetSpec(Part):

@@ -46,7 +46,6 @@ def scene_solid(shape: str) -> SolidMesh:
     """Return the mesh of a scene's object, as the solver makes it."""
     content = load_values()
     body = content["object"]
-    body.pop("support_angle_rad", None)
     body["geometry"] = geometry(shape)
     body["support"] = {"kind": "strip", "angle_rad": 1.5}
     return build_mesh(mesh_spec(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006)))

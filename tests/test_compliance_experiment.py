@@ -120,7 +120,7 @@ def test_the_reference_is_found_for_scaled_scenes_and_its_positions_only(tmp_pat
     curve = {
         "radius": geometry.radius_m / finger,
         "length": geometry.length_m / finger,
-        "support_angle_rad": SCENE.object.support_angle_rad,
+        "support_angle_rad": SCENE.object.support.angle_rad,
         "poisson_ratio": SCENE.object.material.poisson_ratio,
         "along": 0.0,
         "angle_rad": 0.0,

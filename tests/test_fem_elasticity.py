@@ -84,7 +84,7 @@ def test_exactly_the_strip_at_the_back_is_fixed(support: float, spacing: float) 
     [
         ({"skin_spacing_m": 0.02}, "skin_spacing_m"),
         ({"skin_spacing_m": float("nan")}, "skin_spacing_m"),
-        ({"support_angle_rad": 7.0}, "support_angle_rad"),
+        ({"support_angle_rad": 7.0}, r"support\.angle_rad"),
         ({"touch_angle_rad": 3.0}, "touch_angle_rad: 3 must be positive and at most"),
     ],
 )

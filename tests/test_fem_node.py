@@ -227,7 +227,7 @@ async def test_another_object_replaces_the_first(bench: Bench) -> None:
             {"world_from_object": {"position_m": [0, 0, 0], "rpy_rad": [0, np.pi / 2, 0]}},
             "towards the user",
         ),
-        ({"support_angle_rad": 6.5}, "support_angle_rad"),
+        ({"support": {"kind": "strip", "angle_rad": 6.5}}, "support.angle_rad"),
         ({"material": {"young_modulus_pa": 4000.0, "poisson_ratio": 0.49995}}, "poisson_ratio"),
         ({"geometry": {"shape": "cylinder", "radius_m": 0.01, "length_m": 0.1}}, "skin_spacing_m"),
     ],
@@ -463,7 +463,7 @@ async def test_another_scene_ends_the_making_of_a_table(few_pushes: None, tmp_pa
     await bench.node.step("scene", scene(), header())
     while "snapshots for" not in bench.node.note:  # noqa: ASYNC110  # notes come without an event
         await asyncio.sleep(0.01)
-    await bench.node.step("scene", scene(support_angle_rad=1.2), header())
+    await bench.node.step("scene", scene(support={"kind": "strip", "angle_rad": 1.2}), header())
     await bench.node.close()
     assert bench.node.errors == 0, bench.node.last_error
     assert not any("table" in path.name and path.suffix == ".npz" for path in tmp_path.iterdir())  # noqa: ASYNC240

@@ -32,7 +32,6 @@ BASE = {"kind": "base", "height_m": 0.01}
 def scene(geometry: dict[str, Any], height_m: float, support: dict[str, Any]) -> Scene:
     """Return the demo's scene with another object, whose front is at the origin."""
     content = load_values()
-    del content["object"]["support_angle_rad"]
     content["object"] |= {
         "geometry": geometry,
         "support": support,

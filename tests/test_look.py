@@ -156,7 +156,7 @@ def test_edges_are_soft(plain: SceneRenderer, correction: Correction) -> None:
 
 def scene_with(tmp_path: Path, appearance: str) -> Path:
     text = CYLINDER.read_text().replace(
-        "  support_angle_rad", f"  appearance: {{{appearance}}}\n  support_angle_rad", 1
+        "  support:", f"  appearance: {{{appearance}}}\n  support:", 1
     )
     path = tmp_path / "scene.yaml"
     path.write_text(text)

@@ -554,7 +554,6 @@ async def test_an_object_that_cannot_be_presented_is_reported_and_nothing_is_sen
         "rpy_rad": [math.pi, 0.0, 0.0],
     }
     data["object"]["support"] = {"kind": "base", "height_m": 0.008}
-    data["object"].pop("support_angle_rad", None)
     await desk.planner.step("scene", Scene.model_validate(data), desk.header())
     assert desk.planner.errors == 1
     assert "object.world_from_object" in desk.planner.last_error

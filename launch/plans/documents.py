@@ -515,10 +515,7 @@ def _existing_part(document: Document, key: Key) -> Key:
         try:
             values = values[part]
         except (KeyError, IndexError, TypeError):
-            # `support_angle_rad` is short for a mapping `support` with the key `angle_rad`.
-            short = "_".join(map(str, key[number:]))
-            is_short = isinstance(values, Mapping) and short in values
-            return (*key[:number], short) if is_short else key[:number]
+            return key[:number]
     return key
 
 
