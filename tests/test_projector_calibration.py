@@ -20,7 +20,6 @@ from flexsheet.launch.calibration.projector import (
     ProjectorError,
     ProjectorPoints,
     calibrate_projector,
-    fit_keystone,
     measure_points,
     project_points,
 )
@@ -178,25 +177,6 @@ def test_images_that_are_not_of_the_patterns_are_rejected(scene: Scene) -> None:
         measure_points([(dark, dark)], scene.camera, scene.projector)
 
 
-@pytest.mark.parametrize("off", np.random.default_rng(4).uniform(-12.0, 12.0, (6, 8)))
-def test_four_corners_by_hand_are_met_exactly(off: np.ndarray) -> None:
-    guess = load_scene(SCENE_FILE).projector
-    world = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
-    wanted = project_points(guess, world) + np.reshape(off, (4, 2))
-    fit = fit_keystone(wanted, 0.1, 0.1, guess)
-    assert np.abs(project_points(fit.projector, world) - wanted).max() < 0.2
-
-
-def test_corners_in_no_order_are_rejected() -> None:
-    guess = load_scene(SCENE_FILE).projector
-    crossed = np.array([[599.0, 499], [199, 99], [199, 499], [599, 99]])
-    with pytest.raises(ProjectorError, match="not a convex quadrangle"):
-        fit_keystone(crossed, 0.1, 0.1, guess)
-    mirrored = np.array([[199.0, 499], [599, 499], [599, 99], [199, 99]])
-    with pytest.raises(ProjectorError, match="no projector near the pose in the scene"):
-        fit_keystone(mirrored, 0.1, 0.1, guess)
-
-
 def test_the_scene_keeps_its_comments_and_gets_the_projector(tmp_path: Path) -> None:
     scene = load_scene(SCENE_FILE)
     found = make_true_projector(scene.projector, seed=5)
@@ -228,7 +208,6 @@ def test_the_command_names_what_is_missing(tmp_path: Path) -> None:
     assert "expected 42 files left*.png, one per pattern, found 0" in failing(
         "--pictures", str(tmp_path)
     )
-    assert "four pixel pairs" in failing("--corners", "1,2 3,4")
 
 
 def test_the_twins_eye_bends_light_as_the_true_lens(scene: Scene, true: Projector) -> None:

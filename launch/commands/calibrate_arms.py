@@ -139,26 +139,6 @@ def arms(
 
 
 @app.command(
-    "arms-scene",
-    epilog=examples("flexsheet calibrate arms-scene arms.yaml lab.yaml -o lab-measured.yaml"),
-)
-def write_scene(
-    calibration: Annotated[Path, typer.Argument(help="Arm calibration file.")],
-    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to copy.")],
-    output: Annotated[Path, options.result_file("Scene file to write.")],
-    as_json: options.JsonOption = False,
-) -> None:
-    """Write a copy of a scene file with the base poses of an arm calibration."""
-    from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.messages.arms_calibration import ArmsCalibration
-
-    _check_new_file(output, "-o")
-    load_scene(scene_file)
-    write_scene_values(scene_file, list_scene_values(ArmsCalibration.load(calibration)), output)
-    print_outcome({"scene": str(output)}, f"scene: {output}", as_json=as_json)
-
-
-@app.command(
     "arms-capture",
     epilog=examples(
         "flexsheet calibrate arms-capture --arm left --scene lab.yaml --board 9x6 "

@@ -46,8 +46,6 @@ TWIN_POSES = 6
     epilog=examples(
         "flexsheet calibrate projector --scene lab.yaml --write-patterns patterns",
         "flexsheet calibrate projector --scene lab.yaml --pictures poses -o lab-measured.yaml",
-        "flexsheet calibrate projector --scene lab.yaml --corners '599,499 199,499 199,99 "
-        "599,99' --rectangle-mm 200x200",
     ),
 )
 def projector(
@@ -73,21 +71,6 @@ def projector(
             "and camera: left00.png, right00.png, ...",
         ),
     ] = None,
-    corners: Annotated[
-        str | None,
-        typer.Option(
-            metavar="'X,Y X,Y X,Y X,Y'",
-            help="Projector pixels that hit the corners of --rectangle-mm on the virtual screen: "
-            "bottom left, bottom right, top right, top left, as the user sees them.",
-        ),
-    ] = None,
-    rectangle_mm: Annotated[
-        str,
-        typer.Option(
-            metavar="WIDTHxHEIGHT",
-            help="Size of the rectangle for --corners, which is centred on the virtual screen, mm.",
-        ),
-    ] = "200x200",
     twin: Annotated[
         bool,
         typer.Option(
@@ -101,8 +84,7 @@ def projector(
     """Calibrate the pose and the lens of the projector, and write the result into a scene.
 
     The data are stereo images of Gray-code patterns that are projected onto the sheet, in three or
-    more poses of the sheet (--pictures). Alternatively, the data are four corners that you have set
-    manually (--corners). With --twin, the images are simulated.
+    more poses of the sheet (--pictures). With --twin, the images are simulated.
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import calibrate_projector, measure_points
@@ -116,33 +98,30 @@ def projector(
         if as_json:
             print_json({"folder": str(write_patterns), "patterns": len(shown)})
         return
-    if (pictures is not None) + (corners is not None) + twin != 1:
+    if (pictures is not None) == twin:
         raise CommandError(
-            "give exactly one of --pictures, --corners and --twin; to capture images, first write "
+            "give exactly one of --pictures and --twin; to capture images, first write "
             "the patterns with --write-patterns FOLDER"
         )
     require_twin(apparatus, simulated=twin)
     true: Projector | None = None
-    if corners is not None:
-        fit = _fit_corners(scene, corners, rectangle_mm)
-    else:
-        if twin:
-            from flexsheet.nodes.twin.projector import make_true_projector
-            from flexsheet.nodes.twin.truth import apply_apparatus
+    if twin:
+        from flexsheet.nodes.twin.projector import make_true_projector
+        from flexsheet.nodes.twin.truth import apply_apparatus
 
-            devices = load_true_devices(apparatus, scene)
-            if devices is None:
-                true = make_true_projector(require_projector(scene), seed=seed)
-            else:
-                true = require_projector(apply_apparatus(scene, devices))
-            views = list(simulate_views(scene, true, devices, TWIN_POSES, seed))
+        devices = load_true_devices(apparatus, scene)
+        if devices is None:
+            true = make_true_projector(require_projector(scene), seed=seed)
         else:
-            assert pictures is not None
-            views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
-        camera = load_camera(scene, calibration)
-        fit = calibrate_projector(
-            measure_points(views, camera, require_projector(scene)), require_projector(scene)
-        )
+            true = require_projector(apply_apparatus(scene, devices))
+        views = list(simulate_views(scene, true, devices, TWIN_POSES, seed))
+    else:
+        assert pictures is not None
+        views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
+    camera = load_camera(scene, calibration)
+    fit = calibrate_projector(
+        measure_points(views, camera, require_projector(scene)), require_projector(scene)
+    )
     if output is not None:
         write_scene_values(scene_file, list_scene_values(fit.projector), output)
     _print_result(scene, fit, true, output, as_json=as_json)
@@ -228,24 +207,6 @@ def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
             "right_from_left": optics.right_from_left,
         }
     )
-
-
-def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
-    import numpy as np
-
-    from flexsheet.launch.calibration.projector import fit_keystone
-
-    try:
-        pixels = np.array([[float(x) for x in pair.split(",")] for pair in corners.split()])
-        width_mm, height_mm = (float(side) for side in rectangle_mm.lower().split("x"))
-        if pixels.shape != (4, 2) or not min(width_mm, height_mm) > 0.0:
-            raise ValueError("expected four pixel pairs and two positive lengths")
-    except ValueError as error:
-        raise CommandError(
-            f"--corners '{corners}' --rectangle-mm {rectangle_mm}: {error}; for example "
-            "--corners '599,499 199,499 199,99 599,99' --rectangle-mm 200x200"
-        ) from error
-    return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, require_projector(scene))
 
 
 def list_scene_values(projector: Projector) -> dict[str, Any]:
