@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.models import rigid
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
+from flexsheet.nodes.triangulator.fingertip import DetectionInput, DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import BlobFilter
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Gate
@@ -58,13 +58,8 @@ def detect_in(
     geometry: StereoGeometry = GEOMETRY,
     **changes: object,
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    found = detect_all(
-        *pictures,
-        geometry=geometry,
-        config=config(**changes),
-        volume=volume,
-        gate=None if expected is None else Gate(expected, radius_m),
-    )
+    gate = None if expected is None else Gate(expected, radius_m)
+    found = detect_all(DetectionInput(pictures, geometry, config(**changes), volume, gate))
     return found.reason, found.measured
 
 
@@ -114,14 +109,9 @@ def test_a_point_is_drawn_and_found_again(
         origins.append(corner)
     for expected in (None, Gate(truth + 0.002, REACH_M)):
         found = detect_all(
-            views[0],
-            views[1],
-            geometry=GEOMETRY,
-            config=config(),
-            volume=VOLUME,
-            gate=expected,
-            left_origin_px=origins[0],
-            right_origin_px=origins[1],
+            DetectionInput(
+                (views[0], views[1]), GEOMETRY, config(), VOLUME, expected, (origins[0], origins[1])
+            )
         )
         reason, measured = found.reason, found.measured
         assert reason == "ok"
@@ -177,15 +167,9 @@ def test_images_of_regions_have_their_origin() -> None:
     views = pictures(twin())
     full = detect_in(views)[1]
     cut = tuple(np.ascontiguousarray(view[180:320, 200:470]) for view in views)
+    corner, gate = (200, 180), Gate(HERE, REACH_M)
     found = detect_all(
-        cut[0],
-        cut[1],
-        geometry=GEOMETRY,
-        config=config(),
-        volume=VOLUME,
-        gate=Gate(HERE, REACH_M),
-        left_origin_px=(200, 180),
-        right_origin_px=(200, 180),
+        DetectionInput((cut[0], cut[1]), GEOMETRY, config(), VOLUME, gate, (corner, corner))
     )
     reason, measured = found.reason, found.measured
     assert reason == "ok"
@@ -343,15 +327,6 @@ def test_a_baseline_too_short_for_the_depth_is_rejected_not_guessed() -> None:
     if measured is not None:
         assert measured.deviation_m > 0.002
         assert error_m(measured) < 5.0 * measured.deviation_m
-
-
-def test_noise_that_is_given_replaces_what_the_method_states() -> None:
-    views = pictures(twin())
-    own, given = detect_in(views)[1], detect_in(views, noise_px=0.5)[1]
-    assert own is not None
-    assert given is not None
-    assert np.array_equal(own.point_world, given.point_world)
-    assert given.deviation_m > 10.0 * own.deviation_m
 
 
 def test_a_crowd_of_lights_never_makes_a_wrong_fingertip() -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.nodes.triangulator.ellipse import integrate_ellipse
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
+from flexsheet.nodes.triangulator.fingertip import DetectionInput, DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.flat_marker import DiscView, estimate_flat_pose
 from flexsheet.nodes.triangulator.marker import (
     BlobFilter,
@@ -255,11 +255,13 @@ def test_the_marker_of_an_apparatus_is_measured(profile: Profile, seed: int) -> 
         )
         marker = tip + camera.marker_offset_m
         found = detect_all(
-            *views,
-            geometry=StereoGeometry.of(scene.camera, calibration),
-            config=DetectorConfig(FILTER, max_reprojection_px=1.5),
-            volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
-            gate=None if number % 2 else Gate(marker, 0.009),
+            DetectionInput(
+                views,
+                StereoGeometry.of(scene.camera, calibration),
+                DetectorConfig(FILTER, max_reprojection_px=1.5),
+                (scene.finger.volume_min_m, scene.finger.volume_max_m),
+                None if number % 2 else Gate(marker, 0.009),
+            )
         )
         reason, measured = found.reason, found.measured
         if reason != "ok" or measured is None:

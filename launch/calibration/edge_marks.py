@@ -24,7 +24,7 @@ from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
+from flexsheet.nodes.triangulator.fingertip import DetectionInput, DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import Gate
@@ -118,16 +118,15 @@ class MarkDetector:
         left_origin_px, right_origin_px: column and row, in the full image, of the first pixel of a
             cropped image.
         """
-        found = detect_all(
-            left,
-            right,
-            geometry=self._geometry,
-            config=self._config,
-            volume=(near_world_m - SEARCH_M, near_world_m + SEARCH_M),
-            gate=Gate(near_world_m, SEARCH_M),
-            left_origin_px=left_origin_px,
-            right_origin_px=right_origin_px,
+        inputs = DetectionInput(
+            (left, right),
+            self._geometry,
+            self._config,
+            (near_world_m - SEARCH_M, near_world_m + SEARCH_M),
+            Gate(near_world_m, SEARCH_M),
+            (left_origin_px, right_origin_px),
         )
+        found = detect_all(inputs)
         if found.reason != "ok" or found.measured is None:
             return None
         return found.measured.point_world

@@ -21,7 +21,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import rotation_from_vector
-from flexsheet.nodes.triangulator.fingertip import detect_all
+from flexsheet.nodes.triangulator.fingertip import DetectionInput, detect_all
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
@@ -178,14 +178,12 @@ def _see_marker(
 
     pad: position (3,) of the fingertip's pad.
     """
-    left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
-    found = detect_all(
-        left,
-        right,
-        geometry=geometry,
-        config=make_detector_config(),
-        volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
-        gate=None,
+    inputs = DetectionInput(
+        camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s),
+        geometry,
+        make_detector_config(),
+        (scene.finger.volume_min_m, scene.finger.volume_max_m),
     )
+    found = detect_all(inputs)
     measured = found.measured
     return measured if found.reason == "ok" else None

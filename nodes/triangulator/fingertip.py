@@ -171,52 +171,36 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """The arguments of `detect_all`.
+    """An image pair, and the settings with which markers are detected in it.
 
-    images: left and right image, which can be cut-outs of the camera images.
-    origins: position (x, y), px, of each image's first pixel in the camera image.
+    images: left and right image (height, width), which can be cut-outs of the camera images.
     volume: minimum and maximum corner (3,), m, of the finger's working volume in the world frame.
-    gate: ball in which the finger's marker is expected; None if the finger is not tracked.
+    gate: ball in which the finger's marker is expected; None to search both full images, which must
+        contain only one marker.
+    origins: position (x, y), px, of each image's first pixel in the camera image.
     """
 
     images: tuple[Image, Image]
-    origins: tuple[Origin, Origin]
     geometry: StereoGeometry
     config: DetectorConfig
     volume: tuple[Floats, Floats]
-    gate: Gate | None
+    gate: Gate | None = None
+    origins: tuple[Origin, Origin] = ((0, 0), (0, 0))
 
 
-def detect_all(
-    left: Image,
-    right: Image,
-    *,
-    geometry: StereoGeometry,
-    config: DetectorConfig,
-    volume: tuple[Floats, Floats],
-    gate: Gate | None,
-    left_origin_px: Origin = (0, 0),
-    right_origin_px: Origin = (0, 0),
-) -> StereoDetection:
+def detect_all(inputs: DetectionInput) -> StereoDetection:
     """Detect the finger's marker and all other markers in an image pair.
-
-    left, right: images (height, width).
-    volume: minimum and maximum corner (3,) m of the finger's working volume in the world frame.
-    gate: region to search; None to search both full images, which must contain only one marker.
-    left_origin_px, right_origin_px: column and row of each image's first pixel on the sensor.
 
     If the finger is not found inside the gate, the full images are searched for other markers.
     """
-    if gate is not None and not np.isfinite(gate.point).all():
-        gate = None
-    images, origins = (left, right), (left_origin_px, right_origin_px)
-    inputs = DetectionInput(images, origins, geometry, config, volume, gate)
+    if inputs.gate is not None and not np.isfinite(inputs.gate.point).all():
+        inputs = replace(inputs, gate=None)
     windows = _search_windows(inputs)
     found = _match_in(inputs, windows)
     if found.reason != "ok":
         if any(
             is_overexposed(image) or is_overexposed(image, window)
-            for image, window in zip(images, windows, strict=True)
+            for image, window in zip(inputs.images, windows, strict=True)
         ):
             found = replace(found, reason="saturated")
         if windows != (None, None):

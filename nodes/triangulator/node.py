@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -31,6 +30,7 @@ from flexsheet.nodes.models.measured_period import MeasuredPeriod
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.triangulator.data_association import DataAssociation
 from flexsheet.nodes.triangulator.fingertip import (
+    DetectionInput,
     DetectorConfig,
     StereoDetection,
     detect_all,
@@ -63,15 +63,14 @@ class ProcessedPair:
     reason: "ok", or why no fingertip was measured.
     measured: marker of the finger, or None if it was not found.
     detection: markers that were found near the expected fingertip.
-    detect: function that detects the markers in the pair again. Its argument `gate` is the ball in
-        which the finger's marker is expected, or None.
+    inputs: images and settings of the detection.
     """
 
     at_ns: int
     reason: FingertipReason
     measured: TriangulatedPoint | None
     detection: StereoDetection
-    detect: Callable[..., StereoDetection]
+    inputs: DetectionInput
 
 
 class Triangulator(Node):
@@ -162,19 +161,16 @@ class Triangulator(Node):
         if header.epoch != self.epoch:  # The camera has restarted, so its times start again.
             self._restart(header.epoch)
         self._adapt_timeout(at_ns)
-        detect_pair = partial(
-            detect_all,
-            pair.left,
-            pair.right,
-            geometry=self.geometry,
-            config=self.config,
-            volume=self.volume,
-            left_origin_px=pair.left_origin_px,
-            right_origin_px=pair.right_origin_px,
+        inputs = DetectionInput(
+            (pair.left, pair.right),
+            self.geometry,
+            self.config,
+            self.volume,
+            self.tracker.gate(at_ns),
+            (pair.left_origin_px, pair.right_origin_px),
         )
-        gate = self.tracker.gate(at_ns)
-        found = detect_pair(gate=gate)
-        detection = self._check.exclude_marks(found, tracked=gate is not None)
+        found = detect_all(inputs)
+        detection = self._check.exclude_marks(found, tracked=inputs.gate is not None)
         if pair.skew_s != 0.0:
             velocity, covariance = self.tracker.velocity_at(at_ns)
             correct = partial(
@@ -200,13 +196,13 @@ class Triangulator(Node):
                 offset_m=self.pad_to_marker_m,
             )
             self.fingertip.publish(fingertip, source_ns=at_ns)
-        return ProcessedPair(at_ns, reason, measured, found, detect_pair)
+        return ProcessedPair(at_ns, reason, measured, found, inputs)
 
     def search_surroundings(self, processed: ProcessedPair) -> None:
         """Search an image pair for clutter once per search period, and update the self-checks."""
         found = processed.detection
         if processed.reason == "ok" and self.association.is_clutter_search_due(processed.at_ns):
-            found = processed.detect(gate=None)
+            found = detect_all(replace(processed.inputs, gate=None))
             others = self._check.exclude_marks(found, tracked=False)
             self.association.track_clutter(processed.at_ns, others)
         self._update_self_checks(processed.at_ns, processed.reason, processed.measured, found)
