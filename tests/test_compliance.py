@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,17 +18,13 @@ from typer.testing import CliRunner
 from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.launch.cli import app, exit_code
 from flexsheet.launch.commands.output import BAD_INPUT
-from flexsheet.launch.health import compliance as compliance_check
 from flexsheet.launch.health.compliance import (
-    FINGERTIP_AGE_S,
     CurveProgress,
     ForceCurveStage,
-    LoopFinding,
     LoopRisk,
-    check_graph,
     find_loop_risk,
 )
-from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.running.precompute import report_time_left
 from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.scene import Scene
@@ -339,32 +334,6 @@ def test_the_risk_of_the_loop_follows_from_object_and_delay(
     if finding is not None:
         assert finding.delay_s == delay_s
         assert "use a" in finding.describe()
-
-
-def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
-    curve = soft_curve(0.8)
-    rows = np.column_stack([curve.depths_m, curve.forces_n])
-    method = SimpleNamespace(name="nonlinear_table")
-    body = SimpleNamespace(method=method, at_rest=lambda: SimpleNamespace(force_curve=rows))
-    table = make_bounds_60_hz()
-    monkeypatch.setattr(compliance_check, "load_cached", lambda *_: table)
-    cached = {"bodies": lambda *_: [body], "is_cached": lambda *_: True}
-    for name, function in cached.items():
-        monkeypatch.setattr(compliance_check.SoftBodyFactory, name, function)
-    late = ["planner.actuation_delay_s=0.2"]
-    found = check_graph(load_graph(DEMO, settings=late))
-    assert found is not None
-    assert found == LoopFinding(LoopRisk.OSCILLATION, FINGERTIP_AGE_S + 0.2, found.error_ratio)
-    assert check_graph(load_graph(DEMO)) is None
-    assert check_graph(load_graph(DEMO, settings=[*late, f"scene={RIGID}"])) is None
-    shown = CliRunner().invoke(app, ["launch", str(DEMO), "--dry-run", "--set", *late])
-    words = "can oscillate, because the sheet follows the finger with a delay of 212 ms"
-    assert words in " ".join(shown.stderr.split())
-    method.name = "linear"
-    assert check_graph(load_graph(DEMO, settings=late)) is None
-    method.name = "nonlinear_table"
-    monkeypatch.setattr(compliance_check.SoftBodyFactory, "is_cached", lambda *_: False)
-    assert check_graph(load_graph(DEMO, settings=late)) is None
 
 
 def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:

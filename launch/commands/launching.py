@@ -106,7 +106,6 @@ def launch(
     for name in without or ():
         find_node(plan, name)
     if dry_run:
-        warn_of_loop_risk(plan)
         if as_json:
             print_json(plan.model_dump(mode="json"))
         else:
@@ -124,7 +123,6 @@ def launch(
                 and node.name not in (without or ())
             ):
                 words.print(f"console: {page_url(node)}")
-        start_loop_check(plan, host)
 
     work = run_graph(plan, host, duration, without=without or (), when_ready=ready)
     raise typer.Exit(asyncio.run(work))
@@ -143,26 +141,6 @@ def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, A
     nodes = [node.name for node in plan.nodes_on(host)]
     omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
     return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes, "omitted": omitted}
-
-
-def warn_of_loop_risk(plan: ResolvedGraph) -> None:
-    """Print a warning if the control loop of sheet and hand can oscillate in this scene."""
-    from flexsheet.launch.health.compliance import check_graph
-
-    finding = check_graph(plan)
-    if finding is not None:
-        words.print(f"warning: {finding.describe()}", style="yellow")
-
-
-def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """Check in a thread whether the control loop of sheet and hand can oscillate.
-
-    The check is omitted if the planner does not run on `host`.
-    """
-    if any(
-        issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
-    ):
-        asyncio.get_running_loop().run_in_executor(None, warn_of_loop_risk, plan)
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexsheet.launch.commands import options
-from flexsheet.launch.commands.launching import describe_run, page_url, run_graph, start_loop_check
+from flexsheet.launch.commands.launching import describe_run, page_url, run_graph
 from flexsheet.launch.commands.output import examples, print_json_line, progress_words, words
 from flexsheet.nodes.signals import keyboard_interrupts
 
@@ -62,7 +62,6 @@ def try_it(
         if as_json:
             print_json_line({"page": url, **describe_run(plan, run, None)})
         words.print(f"[bold]open {url}[/] and drag on the sheet", markup=True)
-        start_loop_check(plan, None)
         if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)
 

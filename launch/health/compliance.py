@@ -14,16 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.messages.units import format_percent
 from flexsheet.nodes import cache
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.cache import load_cached
-from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import (
-    FACTORY_PARAMETERS,
     SoftBodyFactory,
     choose_method,
 )
@@ -39,18 +34,10 @@ from flexsheet.nodes.planner.compliance import (
     fit_compliance,
     make_stretch_limits,
 )
-from flexsheet.nodes.planner.force_table import choose_force_model
-from flexsheet.nodes.planner.hand_bounds import bounds_cache, load_or_compute_bounds
-from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
-FINGERTIP_AGE_S = 0.012
-"""The assumed age (s) of a fingertip position when it is published.
-
-The age is the sum of half an exposure, the read-out time of the camera, and the computing time.
-"""
-
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """The push depths that the report lists, as fractions of the maximum push depth."""
 
@@ -197,45 +184,6 @@ def find_loop_risk(
     free = compute_compliance(scene, law, curve)
     by_sheet = float(np.abs(free.centre.error_ratio).max()) > TARGET_ERROR_RATIO
     return LoopFinding(LoopRisk.SHEET if by_sheet else LoopRisk.DELAY, delay_s, error_ratio)
-
-
-def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
-    """Check the control loop of sheet and hand for risks, before a graph of nodes starts.
-
-    The risks are that the sheet oscillates or renders a wrong force. The parameters of the planner
-    determine the delay of the control loop. Return None if no risk is found.
-
-    Only cached data are used, because their computation can take minutes. If the stability limits
-    or the soft body are not cached, return None. In this case, the planner reports the risk later.
-    """
-    scene = plan.scene_message()
-    planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")
-    if scene is None or not planners or not solvers:
-        return None
-    given = PlannerParameters.model_validate(planners[0].parameters)
-    table = load_cached(bounds_cache(scene.camera.rate_hz), given.cache_dir)
-    if given.choose_compliance(scene) != "force_curve" or table is None:
-        return None
-    solver = FemSolverParameters.model_validate(solvers[0].parameters)
-    method, spacing_m = choose_method(scene, solver.method, solver.skin_spacing_m)
-    folder = solver.cache_dir or cache.default_cache_dir()
-    factory = SoftBodyFactory(spacing_m, folder, **solver.model_dump(include=FACTORY_PARAMETERS))
-    if not factory.is_cached(scene):
-        return None
-    best, *_ = factory.bodies(scene, method, lambda done, total, need: None)
-    if method != "linear" and best.method.name == "linear":
-        return None
-    calibration = given.sheet_calibration
-    law, _ = choose_force_model(
-        scene,
-        None if calibration is None else SheetCalibration.load(calibration),
-        given.cache_dir,
-    )
-    fixed_s = given.prediction_horizon_s
-    delay_s = FINGERTIP_AGE_S + given.actuation_delay_s if fixed_s is None else fixed_s
-    return find_loop_risk(
-        scene, law, ObjectCurve.from_rows(best.at_rest().force_curve), table, delay_s
-    )
 
 
 def describe_estimate(scene: Scene, law: SheetForceModel, curve: Floats) -> str:
