@@ -57,7 +57,7 @@ demo: setup  ## run the experiments of the paper, and draw pictures
 	$(BIN)/flexsheet demo
 
 try: setup  ## open a page in the browser, and touch the object with the mouse
-	$(BIN)/flexsheet try
+	$(BIN)/flexsheet launch demo --browser
 
 lint: $(DEV_STAMP)  ## check style, words and types
 	$(BIN)/ruff check .

@@ -9,8 +9,8 @@ shift
 here=$(dirname "$0")
 for host in "$@"; do
     mkdir -p -m 700 "$here/keys/$host"
-    FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys new "$host"
-    FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys install "$launch_file" "$host"
+    FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys "$host"
+    FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys "$host" --install "$launch_file"
 done
 # The user in the containers is 1000.
 [ "$(id -u)" -ne 0 ] || chown -R 1000 "$here/keys"

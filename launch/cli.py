@@ -24,9 +24,7 @@ from flexsheet.messages.errors import FlexsheetError, describe_error, find_missi
 from flexsheet.messages.files import DISK_ERRORS, make_write_error
 
 COMMANDS: dict[str, tuple[str, ...]] = {
-    "try": ("trying",),
     "launch": ("launching",),
-    "run": ("session:run_app",),
     "stop": ("session:stop_app",),
     "status": ("session:status_app",),
     "logs": ("session:logs_app",),
@@ -54,7 +52,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "commission": ("commission",),
     "precompute": ("precompute",),
     "keys": ("keys",),
-    "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
+    "doctor": ("doctor",),
 }
 """The modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
@@ -82,7 +80,7 @@ def _import(module: str) -> Any:
     return import_module(f"flexsheet.launch.commands.{module}")
 
 
-INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms", "view"})
+INTERRUPTED_AT_ONCE = frozenset({"launch", "topic", "arms", "view"})
 """The commands that SIGINT ends without cleanup until their event loop handles SIGINT.
 
 In all other commands, Python's signal handler raises KeyboardInterrupt, and the command cleans up.
@@ -128,7 +126,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     # Subcommands inherit these settings.
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=examples("flexsheet try", "flexsheet launch demo", "flexsheet topic list"),
+    epilog=examples("flexsheet launch demo --browser", "flexsheet status", "flexsheet topic list"),
 )
 
 

@@ -866,7 +866,7 @@ def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
     if not inside:
         raise BusError(
             f'topic "{topic.name}": other hosts can reach {endpoint}, but there are no keys; '
-            "create keys with: flexsheet keys new"
+            "create keys with: flexsheet keys"
         )
 
 

@@ -71,7 +71,7 @@ NOTE_REMEDIES: dict[NoteCode, str] = {
     NoteCode.EYES_OF_SCENE: "Check the program that measures the eyes: `flexsheet topic echo eye`.",
     NoteCode.FINGER_PATH_REFUSED: "Correct the path, and publish it again: `flexsheet topic pub`.",
     NoteCode.FINGERTIPS_LATE: "If the number grows steadily: " + BUSY_FIRST,
-    NoteCode.FORCE_LIMITED: "Choose another object or sheet: `flexsheet doctor compliance SCENE`.",
+    NoteCode.FORCE_LIMITED: "Choose another object or sheet: docs/hand-in-the-loop.md.",
     NoteCode.FRAME_NOT_RENDERED: "Set `stereo` of the topic `display` to `mono`.",
     NoteCode.FRAMES_MISSED: "If the number grows steadily: " + BUSY_FIRST,
     NoteCode.NO_IMAGES: "Correct the cable, the device, or the file of the parameter `source`.",

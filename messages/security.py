@@ -41,7 +41,7 @@ class SecurityError(FlexsheetError, RuntimeError):
     """Raised if a key is invalid or missing. The text names the file or host, and the remedy."""
 
     remedy = (
-        "Run `flexsheet keys new HOST` on that host, and enter its public key in the launch file "
+        "Run `flexsheet keys HOST` on that host, and enter its public key in the launch file "
         "on every host."
     )
 
@@ -112,7 +112,7 @@ def read_secret(path: Path) -> str:
             if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
                 raise SecurityError(
                     f"{path}: the file belongs to another user; create your own key: "
-                    f"flexsheet keys new {path.stem}"
+                    f"flexsheet keys {path.stem}"
                 )
             if status.st_mode & 0o077:
                 raise SecurityError(
@@ -122,16 +122,16 @@ def read_secret(path: Path) -> str:
             text = file.read(KEY_LENGTH + 2).strip()
     except FileNotFoundError as error:
         raise SecurityError(
-            f"{path}: does not exist; create a key: flexsheet keys new {path.stem}"
+            f"{path}: does not exist; create a key: flexsheet keys {path.stem}"
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise SecurityError(
-            f"{path}: cannot be read: {error}; create a key: flexsheet keys new {path.stem}"
+            f"{path}: cannot be read: {error}; create a key: flexsheet keys {path.stem}"
         ) from error
     if not is_key(text):
         raise SecurityError(
             f"{path}: does not contain a key of {KEY_LENGTH} characters; create a key: "
-            f"flexsheet keys new {path.stem} --replace"
+            f"flexsheet keys {path.stem} --replace"
         )
     return text
 
@@ -163,7 +163,7 @@ class KeyRing:
             raise SecurityError(
                 f'{secret_file}: does not match the key of host "{host}" in the launch file: '
                 f"expected {public.get(host)}, found {own}; write the found key into the launch "
-                "file with flexsheet keys install"
+                "file with flexsheet keys HOST --install"
             )
         return cls(own, secret, public)
 

@@ -33,11 +33,6 @@ from flexsheet.launch.calibration.corners import (
     board_points,
     match_views,
 )
-from flexsheet.launch.calibration.printing import (
-    BORDER_SQUARES,
-    find_black_rectangles,
-    make_svg,
-)
 from flexsheet.launch.calibration.stereo import calibrate_stereo
 from flexsheet.launch.commands.capture import coverage_view, write_pairs
 from flexsheet.launch.plans.documents import BadInputError
@@ -83,50 +78,6 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def camera() -> StereoCamera:
     return Scene.model_validate(small_scene()).camera
-
-
-def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
-    """Return the board as a grey image, which is 0 at black and 255 at white pixels."""
-    border = BORDER_SQUARES * board.square_m
-    across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
-    width, height = np.ceil(across * dots_per_m).astype(int)
-    image = np.full((height, width), 255, np.uint8)
-    for x, y, w, h in find_black_rectangles(board):
-        low = np.ceil((border + np.array([x, y])) * dots_per_m - 0.5).astype(int)
-        high = np.ceil((border + np.array([x + w, y + h])) * dots_per_m - 0.5).astype(int)
-        image[low[1] : high[1], low[0] : high[0]] = 0
-    return image
-
-
-@pytest.mark.parametrize("board", BOARDS, ids=["chessboard", "charuco"])
-def test_a_printed_board_is_found_where_it_was_printed(board: Board) -> None:
-    dots_per_m = 1500.0
-    picture = rasterize(board, dots_per_m)
-    squares = np.array([board.rows + 3, board.columns + 3])
-    assert picture.shape == pytest.approx(tuple(squares * board.square_m * dots_per_m), abs=1)
-    view = CornerFinder(board).find(cv2.GaussianBlur(picture, (0, 0), 0.8))
-    assert view is not None
-    assert np.array_equal(view.ids, np.arange(board.columns * board.rows))
-    expected = (board_points(board)[:, :2] + 2 * board.square_m) * dots_per_m - 0.5
-    if board.kind == "chessboard" and np.linalg.norm(view.pixels[0] - expected[0]) > 100:
-        expected = expected[::-1]  # a chessboard tells its two ends apart by nothing
-    assert np.abs(view.pixels - expected).max() < 0.1
-
-
-def test_the_printed_markers_are_those_that_opencv_draws() -> None:
-    ours = rasterize(CHARUCO, 2000.0)
-    side = round(2000.0 * CHARUCO.square_m)
-    inner = ours[side:-side, side:-side]
-    theirs = cv2.aruco.CharucoBoard(
-        (7, 5), 0.04, 0.025, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    ).generateImage((inner.shape[1], inner.shape[0]))
-    assert np.mean((inner > 127) != (theirs > 127)) < 0.01
-
-
-def test_a_board_file_states_its_true_size() -> None:
-    drawing = make_svg(CHARUCO)
-    assert 'width="360mm" height="296mm" viewBox="0 0 360 296"' in drawing
-    assert "markers of 25 mm, DICT_4X4_50" in drawing
 
 
 @pytest.mark.parametrize(
@@ -401,19 +352,6 @@ def test_errors_name_a_remedy(
     code, _, err = flexsheet("calibrate", "stereo", *words, *GIVEN, "-o", tmp_path / "c.yaml")
     assert code == 2
     assert printed in err
-
-
-def test_a_board_to_print_is_written(flexsheet: Command, tmp_path: Path) -> None:
-    path = tmp_path / "board.svg"
-    code, out, err = flexsheet(
-        "calibrate", "board", *GIVEN, "--marker-mm", 18, "-o", path, "--json"
-    )
-    assert code == 0, err
-    assert json.loads(out)["board"]["kind"] == "charuco"
-    assert path.read_text().startswith("<svg")
-    code, _, err = flexsheet("calibrate", "board", *GIVEN, "-o", tmp_path / "board.txt")
-    assert code == 2
-    assert "use .svg" in err
 
 
 def launch_file(folder: Path, calibration: Path) -> Path:

@@ -592,12 +592,6 @@ async def test_a_program_reads_a_graph_of_another_process() -> None:
     assert read == ["beacon", "beacon"]
 
 
-def test_a_node_that_runs_is_not_started_again(flexsheet: Command, running: Path) -> None:
-    printed = flexsheet("run", "beacon")
-    assert (printed.code, "--without beacon" in printed.err) == (1, True)
-    assert 'did you mean "beacon"?' in flexsheet("run", "becon").err
-
-
 def test_a_node_that_is_omitted_must_exist(
     flexsheet: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -612,30 +606,20 @@ def test_a_node_that_is_omitted_must_exist(
     assert names == load_graph(DEMO_FILE).nodes.keys() - {"planner"}
 
 
-def test_a_node_runs_alone_and_a_graph_is_stopped(tmp_path: Path, runs_root: Path) -> None:
-    """A graph without a node works with that node from another terminal, and ends on `stop`."""
-    file = write(tmp_path, GRAPH)
+def test_a_graph_is_stopped(tmp_path: Path, runs_root: Path) -> None:
     command = [sys.executable, "-m", "flexsheet"]
     graph = subprocess.Popen(
-        [*command, "launch", str(file), "--without", "beacon", "--json"],
+        [*command, "launch", str(write(tmp_path, GRAPH)), "--json"],
         cwd=ROOT, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    node = None
     try:
         assert graph.stdout is not None
         run = json.loads(graph.stdout.readline())["run"]
-        node = subprocess.Popen([*command, "run", "beacon", "--run", run], cwd=ROOT)
-        echo = [*command, "topic", "echo", "twin/finger", "-1", "--json", "--run", run]
-        inbox = subprocess.check_output(echo, cwd=ROOT, timeout=DEADLINE_S)
-        assert json.loads(inbox)["header"]["writer"] == "beacon"
-        node.send_signal(signal.SIGINT)
-        assert node.wait(DEADLINE_S) == 0
         subprocess.run([*command, "stop", "--run", run], cwd=ROOT, check=True, timeout=DEADLINE_S)
         assert graph.wait(DEADLINE_S) == 0
     finally:
-        for process in (graph, node):
-            if process is not None and process.poll() is None:
-                process.kill()
+        if graph.poll() is None:
+            graph.kill()
         if graph.stdout is not None:
             graph.stdout.close()
 
@@ -880,5 +864,5 @@ def test_a_family_is_charted(
 
 
 def test_the_schema_of_scene_files_is_printed(flexsheet: Command) -> None:
-    schema = flexsheet("scene", "schema").json()
+    schema = flexsheet("scene").json()
     assert {"object", "sheet", "tolerances"} <= schema["properties"].keys()

@@ -268,7 +268,7 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     monkeypatch.setattr(
         "flexsheet.launch.health.compliance.compute_front_curve", lambda scene, **_: rows
     )
-    command = ["doctor", "compliance", str(SCENE_FILE)]
+    command = ["doctor", "scene", str(SCENE_FILE), "--compliance"]
     result = CliRunner().invoke(app, [*command, "--json"])
     assert result.exit_code == code, result.output
     reported = json.loads(result.stdout)
@@ -296,7 +296,7 @@ def test_the_doctor_names_its_stages_and_gives_an_estimate_before_the_table(
         return rows
 
     monkeypatch.setattr("flexsheet.launch.health.compliance.compute_front_curve", compute)
-    result = CliRunner().invoke(app, ["doctor", "compliance", str(SCENE_FILE)])
+    result = CliRunner().invoke(app, ["doctor", "scene", str(SCENE_FILE), "--compliance"])
     assert result.exit_code == 0, result.output
     first, second, third, *_ = result.stderr.splitlines()
     assert first == f"{ForceCurveStage.LINEAR}: 100 %"
@@ -339,7 +339,7 @@ def test_the_risk_of_the_loop_follows_from_object_and_delay(
 def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
     missing = str(tmp_path / "none.yaml")
     result = CliRunner().invoke(
-        app, ["doctor", "compliance", str(SCENE_FILE), "--calibration", missing]
+        app, ["doctor", "scene", str(SCENE_FILE), "--compliance", "--calibration", missing]
     )
     assert isinstance(result.exception, CalibrationFileError)
     assert exit_code(result.exception) == BAD_INPUT

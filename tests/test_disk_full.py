@@ -37,9 +37,8 @@ LAUNCH = (
 KEY = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
 
 COMMANDS = {
-    "keys new": "keys new left",
-    "keys install": "keys install {disk}/graph.yaml main {key}",
-    "calibrate board": "calibrate board --board 9x6 --square-mm 25 -o {disk}/board.svg",
+    "keys": "keys left",
+    "keys --install": "keys main --install {disk}/graph.yaml --key {key}",
     "bag export": "bag export {bag} -o {disk}/out.mcap",
     "bag export --format bag": "bag export {bag} -o {disk}/out.mcap --format bag",
     "bag report": "bag report {bag} -o {disk}/out.html",

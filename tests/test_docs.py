@@ -129,7 +129,7 @@ def test_a_page_with_a_generated_table_names_the_command_that_prints_it(table: s
         "commands": "flexsheet --help",
         "message-types": "flexsheet topic info TOPIC",
         "parameters": "flexsheet node info TYPE",
-        "scene-keys": "flexsheet scene schema",
+        "scene-keys": "flexsheet scene",
         "topics": "flexsheet topic list --all",
     }
     (page,) = (

@@ -60,8 +60,7 @@ CHEAP = (
     "flexsheet node ",
     "flexsheet topic list",
     "flexsheet topic info",
-    "flexsheet calibrate board",
-    "flexsheet keys new",
+    "flexsheet keys",
 )
 """The beginnings of commands to run in a separate folder.
 

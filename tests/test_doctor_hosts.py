@@ -1,4 +1,4 @@
-"""Findings of `flexsheet doctor hosts` about hosts that report, and about those that do not."""
+"""Findings of `flexsheet doctor` about hosts that report, and about those that do not."""
 
 from __future__ import annotations
 

@@ -369,7 +369,7 @@ def test_a_speed_that_is_too_high_gives_a_warning(
     monkeypatch.setattr(layout, "check_layout", lambda *_: found)
     code, out, err = flexsheet("doctor", "scene", SCENE_FILE)
     assert code == 0
-    assert f"flexsheet doctor compliance {SCENE_FILE}" in err
+    assert f"flexsheet doctor scene {SCENE_FILE} --compliance" in err
     assert re.search(r"^warning: the arms follow \d+ mm/s at only [\d.]+ % of", out, re.M)
 
 

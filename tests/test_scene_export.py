@@ -113,7 +113,7 @@ def test_the_models_of_all_shipped_scenes_have_one_root() -> None:
 
 def test_a_model_is_written_or_printed(tmp_path: Path) -> None:
     def run(*words: str | Path) -> Any:
-        return CliRunner().invoke(app, ["scene", "export", "cylinder", *map(str, words)])
+        return CliRunner().invoke(app, ["scene", "cylinder", *map(str, words)])
 
     printed = run()
     assert printed.exit_code == 0

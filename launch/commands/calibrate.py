@@ -20,8 +20,6 @@ from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
-    print_fields,
-    print_json,
     print_result,
     progress_bar,
     words,
@@ -231,39 +229,6 @@ def check(
             "underestimated; use other images"
         )
     print_result(result, as_json=as_json)
-
-
-@app.command(
-    "board",
-    epilog=examples(
-        "flexsheet calibrate board --board 9x6 --square-mm 25 -o board.svg",
-        "flexsheet calibrate board --board 9x6 --square-mm 25 --marker-mm 18 -o board.svg",
-    ),
-)
-def print_board(
-    *,
-    board: BoardOption,
-    square_mm: SquareOption,
-    output: Annotated[Path, options.result_file("Image file to write (.svg).", "IMAGE")],
-    marker_mm: MarkerOption = None,
-    dictionary: DictionaryOption = FOUR_BITS,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Write an image of a calibration board, to be printed at true size.
-
-    The board is a ChArUco board if --marker-mm is given. Otherwise, it is a chessboard.
-    """
-    from flexsheet.launch.calibration.printing import make_caption, make_svg
-    from flexsheet.messages.files import write_file
-
-    described = parse_board(board, square_mm, marker_mm, dictionary)
-    if output.suffix.lower() != ".svg":
-        raise CommandError(f"--output {output}: the board is an SVG file; use .svg")
-    write_file(output, make_svg(described))
-    if as_json:
-        print_json({"file": str(output), "board": described.model_dump(mode="json")})
-    else:
-        print_fields([("file", output), ("board", make_caption(described))])
 
 
 def _check_single_source(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -139,69 +139,85 @@ def arms(
 
 
 @app.command(
-    "arms-capture",
     epilog=examples(
-        "flexsheet calibrate arms-capture --arm left --scene lab.yaml --board 9x6 "
-        "--square-mm 10 -o places-left"
+        "flexsheet calibrate capture left --scene lab.yaml --board 9x6 --square-mm 10 -o left",
+        "flexsheet calibrate capture edges --scene lab.yaml -o marks.csv",
     ),
 )
 def capture(
     *,
-    side: Annotated[
-        str,
-        typer.Option(
-            "--arm", metavar="left|right", help="Arm whose poses are recorded: left or right."
+    kind: Annotated[
+        Literal["left", "right", "edges"],
+        typer.Argument(
+            metavar="left|right|edges",
+            help="left, right: board on the flange of this arm, for `calibrate arms`. edges: marks "
+            "on both clamps, for `calibrate edges`.",
         ),
     ],
-    board: BoardOption,
-    square_mm: SquareOption,
     output: Annotated[
         Path,
-        typer.Option(
-            "-o", "--output", metavar="FOLDER", help="New folder for joints.csv and board images."
-        ),
+        options.output_file("New folder for joints.csv and images, or new CSV file of marks."),
     ],
     scene_file: options.SceneOption,
+    board: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the board, such as 9x6."),
+    ] = None,
+    square_mm: Annotated[
+        float | None, typer.Option(help="Side of a square of the board, mm.", min=0.1)
+    ] = None,
     places: Annotated[
         int, typer.Option(help="Number of poses to record; then the command stops.", min=1)
-    ] = 20,
+    ] = 24,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     run: options.RunOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Record joint angles and board images for `calibrate arms`, from the running graph.
+    """Record poses of the arms with images of the running graph, for a calibration.
 
-    Mount the board on the flange and move the arm with its teach pendant. The command records a
-    pose when the arm is at rest and the board is in a new pose. Ctrl-C ends the recording.
+    For `left` and `right`, mount the board on the flange of this arm and move the arm with its
+    teach pendant.
+
+    For `edges`, fix three bright marks on each clamp: one at the clamp's centre, one above it and
+    one below it. The upper and the lower mark are 45 % of the clamp's length away from the centre.
+    Move the sheet to poses that differ in position, rotation and stretch.
+
+    The command records a pose when the arms are at rest in a new pose. Ctrl-C ends the recording.
     """
     from flexsheet.launch.calibration.arm_poses import PoseRecorder, make_lens_rig
+    from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene
 
-    if side not in SIDES:
-        raise CommandError(f"--arm {side}: unknown arm; give left or right")
+    if (kind == "edges") == (board is not None or square_mm is not None):
+        raise CommandError("give --board and --square-mm for left and right, and not for edges")
     scene = load_scene(scene_file)
-    described = parse_board(board, square_mm, marker_mm, dictionary)
+    optics = load_optics(calibration, scene)
+    recorder: PoseRecorder | EdgeMarkRecorder
     try:
-        output.mkdir(parents=True)
+        if kind == "edges":
+            recorder = EdgeMarkRecorder(output, scene, optics)
+        else:
+            described = parse_board(board or "", square_mm or 0.0, marker_mm, dictionary)
+            output.mkdir(parents=True)
+            recorder = PoseRecorder(output, described, make_lens_rig(scene, optics))
     except OSError as error:
         raise CommandError(
-            f"-o {output}: cannot be created: {error.strerror}; name a new folder"
+            f"-o {output}: cannot be created: {error.strerror}; give another name"
         ) from error
-    recorder = PoseRecorder(
-        output, described, make_lens_rig(scene, load_optics(calibration, scene))
-    )
-    size = (scene.camera.width_px, scene.camera.height_px)
 
     def on_arm(state: Any, time_s: float) -> None:
-        recorder.update_joints(state.joints_rad, time_s)
+        if isinstance(recorder, EdgeMarkRecorder):
+            recorder.update_joints(state.side, state.joints_rad, time_s)
+        else:
+            recorder.update_joints(state.joints_rad, time_s)
 
-    run_interruptible(
-        record_poses(recorder, on_arm, [f"arm_{side}"], size=size, places=places, run=run)
-    )
+    size = (scene.camera.width_px, scene.camera.height_px)
+    arm_topics = [f"arm_{side}" for side in SIDES if kind in (side, "edges")]
+    run_interruptible(record_poses(recorder, on_arm, arm_topics, size=size, places=places, run=run))
     print_outcome(
-        {"folder": str(output), "poses": recorder.count},
+        {"output": str(output), "poses": recorder.count},
         f"{recorder.count} poses in {output}",
         as_json=as_json,
     )

@@ -18,21 +18,15 @@ from flexsheet.launch.commands.calibrate import (
     round_digits,
     write_scene_values,
 )
-from flexsheet.launch.commands.calibrate_arms import record_poses
-from flexsheet.launch.commands.graph import run_interruptible
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
-    print_outcome,
     print_result,
 )
 
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.edge_fit import EdgeFit
     from flexsheet.messages.types import Side
-
-POSES = 24
-"""The number of poses after which `calibrate edges-capture` stops."""
 
 
 @app.command(
@@ -51,7 +45,7 @@ def edges(
     rows: Annotated[
         Path | None,
         typer.Option(
-            metavar="CSV", help="CSV file of measured marks, from `calibrate edges-capture`."
+            metavar="CSV", help="CSV file of measured marks, from `calibrate capture edges`."
         ),
     ] = None,
     scene_file: options.SceneOption = options.CYLINDER,
@@ -116,44 +110,3 @@ def list_scene_values(fits: dict[Side, EdgeFit]) -> dict[str, Any]:
         values[f"{key}.joint_offsets_rad"] = [round_digits(one) for one in arm.joint_offsets_rad]
         values[f"{key}.flange_compliance_m_per_n"] = round_digits(arm.flange_compliance_m_per_n)
     return values
-
-
-@app.command("edges-capture", epilog=examples("flexsheet calibrate edges-capture -o marks.csv"))
-def edges_capture(
-    *,
-    output: Annotated[Path, options.output_file("New CSV file for the marks.")],
-    scene_file: options.SceneOption = options.CYLINDER,
-    calibration: CalibrationOption = None,
-    run: options.RunOption = None,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Record marks on both clamps for `calibrate edges`, from the running graph.
-
-    Fix three bright marks on each clamp: one at the clamp's centre, one above it and one below it.
-    The upper and the lower mark are 45 % of the clamp's length away from the centre. Move the sheet
-    to poses that differ in position, rotation and stretch. The command records a pose when both
-    arms are at rest. It stops after 24 poses or at Ctrl-C.
-    """
-    from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
-    from flexsheet.launch.plans.plan import load_scene
-
-    scene = load_scene(scene_file)
-    try:
-        recorder = EdgeMarkRecorder(output, scene, load_optics(calibration, scene))
-    except OSError as error:
-        raise CommandError(
-            f"-o {output}: cannot be created: {error.strerror}; name a new file"
-        ) from error
-    size = (scene.camera.width_px, scene.camera.height_px)
-
-    def on_arm(state: Any, time_s: float) -> None:
-        recorder.update_joints(state.side, state.joints_rad, time_s)
-
-    run_interruptible(
-        record_poses(recorder, on_arm, ["arm_left", "arm_right"], size=size, places=POSES, run=run)
-    )
-    print_outcome(
-        {"rows": str(output), "poses": recorder.count},
-        f"{recorder.count} poses in {output}",
-        as_json=as_json,
-    )

@@ -73,14 +73,14 @@ It results from the errors of the scale (0.2 g) and of the ruler (0.5 mm).
 INSTRUCTIONS: dict[StepName, str] = {
     StepName.CAMERA: "capture board images with `flexsheet calibrate stereo --device-source ... "
     "--pictures FOLDER`, and give --data camera=FOLDER",
-    StepName.ARMS: "record poses with `flexsheet calibrate arms-capture` to FOLDER/left and "
+    StepName.ARMS: "record poses with `flexsheet calibrate capture` to FOLDER/left and "
     "FOLDER/right, and give --data arms=FOLDER",
     StepName.SHEET: "measure pushes as for `flexsheet calibrate sheet --rows`, and give --data "
     "sheet=CSV; weigh the sheet, and give its mass per area with --sheet-kg-per-m2",
     StepName.PROJECTOR: "write the patterns with `flexsheet calibrate projector --write-patterns`, "
     "capture them on the sheet in six poses, and give --data projector=FOLDER",
     StepName.EDGES: "fix three marks on each clamp, record them with `flexsheet calibrate "
-    "edges-capture`, and give --data edges=CSV",
+    "capture edges`, and give --data edges=CSV",
     StepName.MARKER: "touch known points as for `flexsheet calibrate marker --rows`, and give "
     "--data marker=CSV; give the finger's radius with --finger-radius-mm",
     StepName.EYES: "align a bead with projected crosses, with one eye closed, record the positions "

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
+from flexsheet.launch.commands.doctor_compliance import check_compliance
+from flexsheet.launch.commands.doctor_hosts import (
+    check_launch_file,
+    check_running_graph,
+    print_findings,
+)
 from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -20,14 +28,15 @@ from flexsheet.launch.commands.output import (
 )
 from flexsheet.messages.units import format_percent
 
-if TYPE_CHECKING:
-    pass
-
 app = typer.Typer(
     add_completion=False,
     invoke_without_command=True,
     help="Check this computer, and all hosts of the running graph.",
-    epilog=examples("flexsheet doctor", "flexsheet doctor --sweep", "flexsheet doctor --json"),
+    epilog=examples(
+        "flexsheet doctor",
+        "flexsheet doctor --launch launch/lab.yaml --host left",
+        "flexsheet doctor --sweep",
+    ),
 )
 
 
@@ -40,16 +49,28 @@ def doctor(
             "--sweep", help="First end processes that crashed launchers have left running."
         ),
     ] = False,
+    launch_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--launch", help="Launch file whose hosts are checked, too.", **options.LAUNCH_FILE
+        ),
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST",
+            help="Name of this computer in the launch file; default: determined from its address.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check that this computer can run flexsheet.
 
-    If a graph of several computers is running, all of them are checked. The exit code is 1 if a
-    check fails.
+    If a graph of several computers is running, all of them are checked. With --launch, the
+    connections to all hosts of this launch file are checked. The exit code is 1 if a check fails.
     """
     if context.invoked_subcommand is not None:
         return
-    from flexsheet.launch.commands.doctor_hosts import check_running_graph, print_findings
     from flexsheet.launch.health.doctor import check_computer
     from flexsheet.launch.running.runs import sweep as sweep_leftovers
 
@@ -57,7 +78,11 @@ def doctor(
         ended = sweep_leftovers()
         words.print(f"ended {len(ended)} processes that crashed launchers had left running")
     with words.status("checking"):
-        findings = [*check_computer(), *check_running_graph()]
+        findings = list(check_computer())
+        if launch_file is None:
+            findings += check_running_graph()
+        else:
+            findings += check_launch_file(launch_file, host)
     if as_json:
         print_json([asdict(one) for one in findings])
     else:
@@ -68,10 +93,35 @@ def doctor(
 
 @app.command(
     "scene",
-    epilog=examples("flexsheet doctor scene launch/scenes/cylinder.yaml"),
+    epilog=examples(
+        "flexsheet doctor scene launch/scenes/cylinder.yaml",
+        "flexsheet doctor scene launch/scenes/cylinder.yaml --compliance --delay-ms 80",
+    ),
 )
 def check_scene(
+    *,
     scene_file: SceneArgument,
+    compliance: Annotated[
+        bool,
+        typer.Option(
+            "--compliance",
+            help="Instead, check that the sheet can feel as soft as the virtual object.",
+        ),
+    ] = False,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="With --compliance: file from `flexsheet calibrate sheet`."),
+    ] = None,
+    delay_ms: Annotated[
+        float,
+        typer.Option(
+            metavar="MS",
+            min=0.0,
+            max=500.0,
+            help="With --compliance: delay from a measurement of the finger's depth to the sheet's "
+            "motion, ms.",
+        ),
+    ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
     """Check that both arms reach the whole working range of a scene.
@@ -84,7 +134,14 @@ def check_scene(
     The joint solutions of an RV-1A or RV-2FR have names. "Shoulder front" means that the wrist
     centre is in front of the plane through the axes of J1 and J2. "Elbow up" means that J3 is
     greater than the angle at which the arm is straight. "Wrist flipped" means that J5 is negative.
+
+    With --compliance, the command compares the force of the object's model with the rendered force
+    for pushes at the centre, and checks that hand and sheet cannot oscillate. The first call
+    computes the object's model, which takes minutes.
     """
+    if compliance:
+        check_compliance(scene_file, calibration, delay_ms=delay_ms, as_json=as_json)
+        return
     from flexsheet.launch.health.layout import check_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
 
@@ -99,7 +156,7 @@ def check_scene(
         if scene.object.material is not None:
             words.print(
                 "whether the sheet can be as stiff as the object is a separate check: flexsheet "
-                f"doctor compliance {scene_file}"
+                f"doctor scene {scene_file} --compliance"
             )
     if not layout.reachable:
         raise typer.Exit(FAILED)

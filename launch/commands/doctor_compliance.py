@@ -1,17 +1,13 @@
-"""`flexsheet doctor compliance`: check that the sheet can feel as soft as the virtual object."""
+"""Check that the sheet can feel as soft as the virtual object: `doctor scene --compliance`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from flexsheet.launch.commands.doctor import app
-from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
     FAILED,
-    examples,
     print_columns,
     print_json,
     print_result,
@@ -20,31 +16,17 @@ from flexsheet.launch.commands.output import (
 )
 
 
-@app.command(
-    epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
-)
-def compliance(
-    scene_file: SceneArgument,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Sheet calibration file from `flexsheet calibrate sheet`.")
-    ] = None,
-    delay_ms: Annotated[
-        float,
-        typer.Option(
-            metavar="MS",
-            min=0.0,
-            max=500.0,
-            help="Delay from a measurement of the finger's depth to the sheet's motion, ms.",
-        ),
-    ] = 60.0,
-    as_json: JsonOption = False,
+def check_compliance(
+    scene_file: Path, calibration: Path | None, *, delay_ms: float, as_json: bool
 ) -> None:
-    """Check that the sheet can feel as soft as the virtual object of a scene.
+    """Compare the force of the object's model with the rendered force, and print the result.
 
-    The command compares the force of the object's model with the rendered force, for pushes at the
-    centre up to the maximum depth of the scene. It also checks that hand and sheet cannot oscillate
-    at the given delay. The first call computes the object's model, which takes minutes. The exit
-    code is 1 if a check fails.
+    The pushes are at the centre, up to the maximum depth of the scene. Also check that hand and
+    sheet cannot oscillate.
+
+    delay_ms: delay from a measurement of the finger's depth to the sheet's motion.
+
+    Raises typer.Exit with the exit code 1 if a check fails.
     """
     from flexsheet.launch.health.compliance import (
         ForceCurveStage,

@@ -1,22 +1,14 @@
-"""`flexsheet doctor hosts`: check all hosts of a launch file, and print remedies for the faults."""
+"""Check all hosts of a launch file or of the running graph for `flexsheet doctor`."""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from flexsheet.launch.commands.doctor import app
 from flexsheet.launch.commands.graph import running_graph
-from flexsheet.launch.commands.options import LAUNCH_FILE, JsonOption
 from flexsheet.launch.commands.output import (
-    FAILED,
     CommandError,
-    examples,
-    print_json,
     print_table,
     words,
 )
@@ -29,57 +21,22 @@ if TYPE_CHECKING:
 TIMEOUT_S = 4.0
 
 
-@app.command(
-    epilog=examples(
-        "flexsheet doctor hosts",
-        "flexsheet doctor hosts launch/lab.yaml",
-        "flexsheet doctor hosts launch/lab.yaml --host left --json",
-    ),
-)
-def hosts(
-    launch_file: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Launch file; default: launch file of the graph running on this computer.",
-            **LAUNCH_FILE,
-        ),
-    ] = None,
-    host: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST",
-            help="Name of this computer in the launch file; default: determined from its address.",
-        ),
-    ] = None,
-    timeout: Annotated[
-        float,
-        typer.Option(
-            metavar="SECONDS", help="Maximum time to wait for answers of the hosts, s.", min=1.5
-        ),
-    ] = TIMEOUT_S,
-    as_json: JsonOption = False,
-) -> None:
-    """Check all hosts (computers) of a launch file.
+def check_launch_file(launch_file: Path, host: str | None) -> list[Finding]:
+    """Check this computer and the connections to all hosts of a launch file.
 
-    If the graph is not running, only this computer and the network are checked. The exit code is 1
-    if a check fails.
+    If the graph is running, all its hosts are asked.
+
+    host: name of this computer in the launch file; None determines it from its address.
     """
     plan, run = _find_graph(launch_file)
     here = find_host(plan, run, host)
     if run is not None and run.host not in (None, here):
         run = None
-    with words.status("checking all hosts"):
-        findings = asyncio.run(check_hosts(plan, here, run, timeout))
-    if as_json:
-        print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
-    else:
-        words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}")
-        print_findings(findings)
-    if any(one.state == "failed" for one in findings):
-        raise typer.Exit(FAILED)
+    words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}")
+    return asyncio.run(check_hosts(plan, here, run, TIMEOUT_S))
 
 
-def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[Finding]:
+def check_running_graph() -> list[Finding]:
     """Check the hosts of the running graph; return an empty list if no graph is running.
 
     If the graph runs on one host, only the results of the nodes' own calibration checks are
@@ -92,22 +49,20 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[Finding]:
     if not any(run.plan_file.is_file() for run in list_live_runs()):
         return []
     plan, run = running_graph(None)
-    findings = asyncio.run(check_hosts(plan, tools_host(run), run, timeout_s))
+    findings = asyncio.run(check_hosts(plan, tools_host(run), run, TIMEOUT_S))
     if len(plan.hosts) == 1:
         return [one for one in findings if one.check == SELF_CHECK]
     return findings
 
 
-def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
+def _find_graph(launch_file: Path) -> tuple[ResolvedGraph, Run | None]:
     """Return the resolved graph of a launch file, and its run on this computer.
 
     A run is one execution of a graph. The result contains None instead of a run if the graph is not
-    running. If `launch_file` is None, the newest running graph is used.
+    running.
     """
     from flexsheet.launch.plans.plan import load_graph
 
-    if launch_file is None:
-        return running_graph(None)
     plan = load_graph(launch_file)
     try:
         running, run = running_graph(None)

@@ -2,58 +2,53 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated
 
 import typer
-from typer.core import TyperCommand
 
-from flexsheet.launch.commands.options import JsonOption, LaunchArgument, make_app
-from flexsheet.launch.commands.output import (
-    CommandError,
-    examples,
-    print_json,
-    print_outcome,
-    words,
+from flexsheet.launch.commands.options import LAUNCH_FILE, JsonOption, make_app
+from flexsheet.launch.commands.output import CommandError, examples, print_json, words
+
+app = make_app()
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet keys left",
+        "flexsheet keys left --install launch/lab.yaml",
+        "flexsheet keys left --install launch/lab.yaml "
+        "--key 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'",
+    )
 )
-
-KEY_LENGTH = 40
-
-app = make_app("Manage the key pairs by which hosts authenticate each other.")
-
-
-class KeyCommand(TyperCommand):
-    """A command whose last argument can be a public key that starts with "-"."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert "--" before a key that starts with "-", so that it is not parsed as an option."""
-        keys = [one for one in args if one.startswith("-") and len(one) == KEY_LENGTH]
-        if keys and "--" not in args:
-            args = [one for one in args if one not in keys] + ["--", *keys]
-        return super().parse_args(ctx, args)
-
-
-HostArgument = Annotated[
-    str, typer.Argument(metavar="HOST", help="Name of the host in the launch file.")
-]
-
-
-@app.command(epilog=examples("flexsheet keys new left"))
-def new(
-    host: HostArgument,
+def keys(
+    *,
+    host: Annotated[
+        str, typer.Argument(metavar="HOST", help="Name of the host in the launch file.")
+    ],
     replace: Annotated[
         bool,
         typer.Option(
             "--replace", help="Overwrite an existing key of the host; it cannot be restored."
         ),
     ] = False,
+    install: Annotated[
+        Path | None,
+        typer.Option("--install", help="Launch file to write the public key into.", **LAUNCH_FILE),
+    ] = None,
+    key: Annotated[
+        str | None,
+        typer.Option(metavar="KEY", help="With --install: public key of another computer."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Create the key pair of this computer if there is none, and print the public key.
+    """Print the public key of this computer as HOST, and create the key pair if there is none.
 
-    Run the command on the host itself. The secret key is stored in a file that only you can read.
+    The secret key is stored in a file that only you can read.
     """
     import re
 
+    from flexsheet.launch.running.keys import install as install_key
     from flexsheet.launch.running.keys import secret_file
     from flexsheet.messages.security import (
         derive_public_key,
@@ -64,47 +59,21 @@ def new(
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
         raise CommandError(f'"{host}": invalid host name; use lower-case letters, digits and _')
+    if key is not None and (install is None or replace):
+        raise CommandError("--key requires --install, and excludes --replace")
     file = secret_file(host)
-    if file.exists() and not replace:
+    if key is not None:
+        public = key
+    elif file.exists() and not replace:
         public = derive_public_key(read_secret(file))
     else:
         public, secret = make_key_pair()
         write_secret(file, secret, replace=replace)
-    words.print(f"secret key: {file}; do not copy it to another computer")
-    words.print(f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'")
+        words.print(f"secret key: {file}; do not copy it to another computer")
+    if install is not None:
+        install_key(install, host, public)
+        words.print(f"{install}: hosts.{host}.key = {public}")
     if as_json:
         print_json({"host": host, "public": public, "secret_file": str(file)})
     else:
         print(public)
-
-
-@app.command(
-    cls=KeyCommand,
-    epilog=examples(
-        "flexsheet keys install launch/lab.yaml left 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'"
-    ),
-)
-def install(
-    launch_file: LaunchArgument,
-    host: HostArgument,
-    key: Annotated[
-        str | None, typer.Argument(help="Public key; default: key of HOST stored on this computer.")
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Write a host's public key into a launch file.
-
-    A running graph of this launch file uses the new key within two seconds, without a restart.
-    """
-    from flexsheet.launch.running.keys import install as install_key
-    from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import derive_public_key, read_secret
-
-    if key is None:
-        key = derive_public_key(read_secret(secret_file(host)))
-    install_key(launch_file, host, key)
-    print_outcome(
-        {"launch_file": str(launch_file), "host": host, "public": key},
-        f"{launch_file}: hosts.{host}.key = {key}",
-        as_json=as_json,
-    )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
+import webbrowser
 from collections.abc import Callable, Collection
 from datetime import datetime
 from pathlib import Path
@@ -37,7 +39,7 @@ LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 
 @app.command(
     epilog=examples(
-        "flexsheet launch demo",
+        "flexsheet launch demo --browser",
         "flexsheet launch launch/demo.yaml --console --record session.mcap",
         "flexsheet launch demo --scene organ",
         "flexsheet launch launch/lab.yaml --host left",
@@ -69,8 +71,7 @@ def launch(
         list[str] | None,
         typer.Option(
             metavar="NODE",
-            help="Node to omit, so that `flexsheet run NODE` can start it; repeat the option for "
-            "several nodes.",
+            help="Node to omit; repeat the option for several nodes.",
         ),
     ] = None,
     record: Annotated[
@@ -82,6 +83,9 @@ def launch(
     ] = None,
     console: Annotated[
         bool, typer.Option("--console", help="Add a browser console and a recorder to the graph.")
+    ] = False,
+    browser: Annotated[
+        bool, typer.Option("--browser", help="Like --console, and open its page in the browser.")
     ] = False,
     duration: options.DurationOption = None,
     as_json: options.JsonOption = False,
@@ -100,7 +104,7 @@ def launch(
         launch_file,
         settings=options.with_scene(settings, scene),
         record=record,
-        console=console,
+        console=console or browser,
         apparatus=apparatus,
     )
     for name in without or ():
@@ -123,6 +127,8 @@ def launch(
                 and node.name not in (without or ())
             ):
                 words.print(f"console: {page_url(node)}")
+                if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+                    webbrowser.open(page_url(node))
 
     work = run_graph(plan, host, duration, without=without or (), when_ready=ready)
     raise typer.Exit(asyncio.run(work))

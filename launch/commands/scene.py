@@ -5,34 +5,34 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, result_file
+import typer
+
+from flexsheet.launch.commands.options import SCENE, JsonOption, make_app, result_file
 from flexsheet.launch.commands.output import (
     examples,
     print_json,
     words,
 )
 
-app = make_app("Print the JSON Schema of scene files, and export a scene to other tools.")
+app = make_app()
 
 
-@app.command(epilog=examples("flexsheet scene schema"))
-def schema(as_json: JsonOption = False) -> None:
-    """Print the JSON Schema of scene files, with which editors complete and check keys."""
-    from flexsheet.messages.scene import Scene
-
-    print_json(Scene.model_json_schema())
-
-
-@app.command(epilog=examples("flexsheet scene export cylinder -o cylinder.urdf"))
+@app.command(epilog=examples("flexsheet scene", "flexsheet scene cylinder -o cylinder.urdf"))
 def export(
-    scene: SceneArgument,
+    scene: Annotated[
+        Path | None,
+        typer.Argument(help="Scene to export; without it, the schema is printed.", **SCENE),
+    ] = None,
     output: Annotated[
         Path | None, result_file("URDF file to write; default: print the text.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a URDF model of the arms, clamps, cameras and projector.
+    """Print the JSON Schema of scene files, or write a URDF model of a scene's devices.
 
+    With the schema, editors complete and check the keys of a scene file.
+
+    The URDF model of SCENE contains the arms, clamps, cameras and projector.
     The joints are named left_joint_1 to left_joint_6 and right_joint_1 to right_joint_6. They can
     be moved in a viewer. The model contains geometry and joint limits, but no masses or torques.
     """
@@ -40,6 +40,11 @@ def export(
     from flexsheet.launch.viewing.apparatus_model import make_model
     from flexsheet.launch.viewing.urdf import make_urdf
     from flexsheet.messages.files import write_file
+    from flexsheet.messages.scene import Scene
+
+    if scene is None:
+        print_json(Scene.model_json_schema())
+        return
 
     model = make_model(load_scene(scene))
     if output is not None:

@@ -1,8 +1,7 @@
-"""`flexsheet status`, `logs`, `stop` and `run`: inspect and stop graphs, and run single nodes."""
+"""`flexsheet status`, `logs` and `stop`: inspect and stop graphs."""
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import time
@@ -19,13 +18,11 @@ from flexsheet.launch.commands.graph import (
     NoGraphError,
     SeveralGraphsError,
     describe_launch,
-    find_node,
     receive_until,
     run_interruptible,
-    run_node_here,
     running_graph,
 )
-from flexsheet.launch.commands.launching import format_log_line, format_log_time, run_graph
+from flexsheet.launch.commands.launching import format_log_line, format_log_time
 from flexsheet.launch.commands.output import (
     FAILED,
     CommandError,
@@ -40,7 +37,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.messages.types import ArmState, HostStatus, Status
 
-status_app, logs_app, stop_app, run_app = (options.make_app() for _ in range(4))
+status_app, logs_app, stop_app = (options.make_app() for _ in range(3))
 
 ARM_TOPICS = frozenset({"arm_left", "arm_right"})
 
@@ -52,11 +49,6 @@ Each node publishes its status once a second.
 
 STOP_TIMEOUT_S = 20.0
 POLL_PERIOD_S = 0.05
-
-NodeArgument = Annotated[
-    str,
-    typer.Argument(metavar="NODE", help="Name of a node of the graph."),
-]
 
 
 @status_app.command(epilog=examples("flexsheet status", "flexsheet status --json"))
@@ -386,70 +378,3 @@ def stop(
     print_rows(rows, as_json=as_json)
     if not all(row["stopped"] for row in rows):
         raise typer.Exit(FAILED)
-
-
-@run_app.command(
-    epilog=examples(
-        "flexsheet run planner",
-        "flexsheet run camera --launch launch/lab.yaml",
-        "flexsheet run renderer --set renderer.rate_hz=20",
-    )
-)
-def run_node(
-    *,
-    node: NodeArgument,
-    launch_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--launch",
-            help="Launch file of a graph that is not running; only this node is started.",
-            **options.LAUNCH_FILE,
-        ),
-    ] = None,
-    scene: options.OtherSceneOption = None,
-    settings: options.SettingsOption = None,
-    duration: options.DurationOption = None,
-    run: options.RunOption = None,
-    as_json: options.JsonOption = False,
-) -> None:
-    """Run one node of a launch file in this terminal until Ctrl-C.
-
-    The node joins the running graph, which must have been started without the node: `flexsheet
-    launch LAUNCH_FILE --without NODE`. With --launch, the command instead starts a new graph that
-    contains only this node.
-    """
-    from flexsheet.launch.plans.plan import load_graph
-
-    given = options.with_scene(settings, scene)
-    if launch_file is not None:
-        plan = load_graph(launch_file, settings=given)
-    else:
-        plan, found = running_graph(run)
-        if given:
-            raise CommandError(
-                "--set and --scene require --launch LAUNCH_FILE, because the running graph has "
-                "fixed settings"
-            )
-    find_node(plan, node)
-    if launch_file is not None:
-        without = [name for name in plan.nodes if name != node]
-        code = asyncio.run(run_graph(plan, None, duration, without=without))
-    else:
-        code = run_interruptible(_join(plan, found, node, duration))
-    if as_json:
-        print_json({"node": node, "exit_code": code})
-    raise typer.Exit(code)
-
-
-async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | None) -> int:
-    from flexsheet.launch.running.node_config import node_config
-
-    if (run.directory / f"{name}.status").exists():
-        raise CommandError(
-            f'node "{name}" is already running in {run.directory}; '
-            f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}",
-            FAILED,
-        )
-    words.print(f"running {name} in {run.directory}; press Ctrl-C to stop")
-    await run_node_here(node_config(plan, plan.nodes[name], run), duration_s)
-    return 0

@@ -209,7 +209,7 @@ def compliance_result(
     delay_s: float,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Return the result of `flexsheet doctor compliance --json`.
+    """Return the result of `flexsheet doctor scene --json --compliance`.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.

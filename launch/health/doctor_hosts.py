@@ -72,7 +72,7 @@ FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.KEY_MISMATCH: (
         "keys",
         "the host's key differs from its key in the launch file of this computer",
-        "on {host}: flexsheet keys new {host}; here: flexsheet keys install {file} {host} 'KEY'",
+        "on {host}: flexsheet keys {host}; here: flexsheet keys {host} --install {file} --key KEY",
     ),
     Reachability.KEY_REJECTED: (
         "keys",
@@ -177,7 +177,7 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Fi
         if probe.host == here:
             remedy = (
                 "the file was changed after the start, or --set was used: start again; to check "
-                "the running graph: flexsheet doctor hosts"
+                "the running graph: flexsheet doctor"
             )
         what = (
             f"the host runs plan {probe.status.plan_hash}, but {plan.launch_file} resolves to plan "
@@ -429,13 +429,13 @@ def check_before_start(
         remedy = "name the right host with --host, or correct the launch file on all hosts"
         yield Finding(here, "address", "failed", what, remedy)
     if key_problem is not None:
-        remedy = f"flexsheet keys install {plan.launch_file} {here}, then copy it to all hosts"
+        remedy = f"flexsheet keys {here} --install {plan.launch_file}, then copy it to all hosts"
         yield Finding(here, "keys", "failed", key_problem, remedy)
     elif plan.keys:
         what = f"{secret_file(here)} matches the launch file; only its owner can read it"
         yield Finding(here, "keys", "ok", what)
     elif not all(map(is_loopback, plan.hosts.values())):
-        remedy = "run flexsheet keys new on each host, then flexsheet keys install: docs/deploy.md"
+        remedy = "create and install a key for each host: docs/deploy.md"
         yield Finding(here, "keys", "failed", "the launch file has no keys", remedy)
     yield check_libraries(here)
     yield _check_ports(plan, here)

@@ -54,14 +54,14 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
                 document.report(
                     ("hosts", name),
                     "the host has no key, but other hosts have one",
-                    f"create one on that host (flexsheet keys new {name}), then: "
-                    f"flexsheet keys install FILE {name} KEY",
+                    f"create one on that host (flexsheet keys {name}), then: "
+                    f"flexsheet keys {name} --install FILE --key KEY",
                 )
         elif not is_key(host.key):
             document.report(
                 where,
                 f'"{host.key}" is not a public key',
-                f"give the 40 characters that `flexsheet keys new {name}` prints",
+                f"give the 40 characters that `flexsheet keys {name}` prints",
             )
         elif host_by_key.setdefault(host.key, name) != name:
             document.report(

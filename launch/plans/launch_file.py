@@ -55,7 +55,7 @@ class HostSpec(StrictModel):
 
     address: str = Field(description="IP address on which the host's nodes listen")
     key: str | None = Field(
-        default=None, description="public key of the host, as printed by flexsheet keys new"
+        default=None, description="public key of the host, as printed by flexsheet keys"
     )
     may_reset_estop: bool | None = Field(
         default=None,

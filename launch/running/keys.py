@@ -74,7 +74,7 @@ def install(launch_file: Path, host: str, key: str) -> None:
             "KEY",
             (),
             f'"{key}" is not a public key',
-            f"give the 40 characters that `flexsheet keys new {host}` prints on that host",
+            f"give the 40 characters that `flexsheet keys {host}` prints on that host",
         )
     yaml = YAML(typ="rt")
     yaml.preserve_quotes = True

@@ -583,8 +583,8 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
             raise read_launch_file(Path(plan.launch_file)).error(
                 ("hosts", name, "address"),
                 f"connections to {address} must be encrypted, but the hosts have no keys",
-                f"create a key on each host (flexsheet keys new {name}) and install all "
-                f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
+                f"create a key on each host (flexsheet keys {name}) and install all "
+                f"of them: flexsheet keys {name} --install {plan.launch_file} --key KEY",
             )
 
 
