@@ -131,7 +131,7 @@ class NodeTransport:
 
         return on_refused
 
-    def open_inputs(self, node: Node) -> None:
+    async def open_inputs(self, node: Node) -> None:
         if self._config.clocks is not None:
             subscriber = Subscriber(
                 find_topic(self._config.clocks.topic),
@@ -168,9 +168,9 @@ class NodeTransport:
             subscriber.start()
             self._subscribers.append(subscriber)
             if node.opens_devices and not node.takes_frames and node_input.topic.message is EStop:
-                self._open_stop_socket(node, config.port)
+                await self._open_stop_socket(node, config.port)
 
-    def _open_stop_socket(self, node: Node, port: str) -> None:
+    async def _open_stop_socket(self, node: Node, port: str) -> None:
         """Open a socket for e-stops from tools. It works even if the launcher does not respond."""
 
         def stop(reason: str) -> None:
@@ -179,7 +179,7 @@ class NodeTransport:
             node.deliver(port, EStop(engaged=True, reason=reason), header)
 
         self._stop_socket = StopSocket(Path(self._config.run_dir), "node", node.name, stop)
-        self._stop_socket.open()
+        await self._stop_socket.open()
 
     def _end_input(self, node: Node, port: str) -> None:
         """Record that the writer of an input port has ended.
@@ -328,7 +328,7 @@ async def run_node(
         transport.close()
         raise
     try:
-        transport.open_inputs(node)
+        await transport.open_inputs(node)
         for number, timer in enumerate(find_timers(class_)):
             tasks.append(asyncio.create_task(run_timer(node, number, timer)))
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,8 +31,7 @@ from flexsheet.launch.running.stopping import (
     stop_arms,
 )
 from flexsheet.messages.notes import Note
-from flexsheet.nodes import stop_socket
-from flexsheet.nodes.stop_socket import MAX_CONNECTIONS, StopSocket
+from flexsheet.nodes.stop_socket import ANSWER, SUFFIX, StopSocket
 from tests.console_parts import status_of
 from tests.waiting import DEADLINE_S, wait_until
 
@@ -184,9 +184,9 @@ class Sockets:
         self.reasons: list[str] = []
         self.opened: list[StopSocket] = []
 
-    def open(self, kind: Any, name: str) -> None:
+    async def open(self, kind: Any, name: str) -> None:
         self.opened.append(StopSocket(self.folder, kind, name, self.reasons.append))
-        self.opened[-1].open()
+        await self.opened[-1].open()
 
     async def stop(self, reason: str = REASON) -> list[StopAttempt]:
         return await asyncio.to_thread(stop_arms, [self.folder], reason)
@@ -198,8 +198,8 @@ def sockets(runs_root: Path) -> Sockets:
 
 
 async def test_all_are_asked_at_once_and_others_may_not_connect(sockets: Sockets) -> None:
-    sockets.open("launcher", "launch")
-    sockets.open("node", "arm_left_bridge")
+    await sockets.open("launcher", "launch")
+    await sockets.open("node", "arm_left_bridge")
     for file in sockets.folder.iterdir():
         assert file.stat().st_mode & 0o777 == 0o600
     attempts = await sockets.stop("é" * 10_000)
@@ -214,25 +214,12 @@ async def test_all_are_asked_at_once_and_others_may_not_connect(sockets: Sockets
     assert list(sockets.folder.iterdir()) == []
 
 
-async def test_another_user_stops_nothing(
-    sockets: Sockets, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sockets.open("launcher", "launch")
-    outsider = os.getuid() + 1
-    monkeypatch.setattr(stop_socket, "read_peer", lambda connection: (1, outsider))
-    attempts = await sockets.stop()
-    assert [one.worked for one in attempts] == [False]
-    assert sockets.reasons == []
-    for one in sockets.opened:
-        one.close()
-
-
 async def test_an_invalid_request_stops_nothing_and_is_answered(sockets: Sockets) -> None:
-    sockets.open("launcher", "launch")
+    await sockets.open("launcher", "launch")
     (file,) = sockets.folder.iterdir()
     held = []
-    for content in [b"", b"reset", b"\0" * 100, *([None] * (2 * MAX_CONNECTIONS))]:
-        held.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+    for content in [b"", b"reset\n", b"\0" * 10_000, b"stop without an end", *([None] * 50)]:
+        held.append(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
         await asyncio.to_thread(held[-1].connect, str(file))
         if content is not None:
             held[-1].send(content)
@@ -246,10 +233,10 @@ async def test_an_invalid_request_stops_nothing_and_is_answered(sockets: Sockets
 def test_a_socket_of_the_dead_is_absent_and_a_silent_launcher_is_not_killed(
     runs_root: Path,
 ) -> None:
-    dead = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    dead = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     dead.bind(str(runs_root / "bridge.node.stop"))
     dead.close()
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as silent:
         silent.bind(str(runs_root / "launch.launcher.stop"))
         silent.listen()
         attempts = stop_arms([runs_root], REASON)
@@ -260,7 +247,7 @@ def test_a_socket_of_the_dead_is_absent_and_a_silent_launcher_is_not_killed(
 
 
 def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path) -> None:
-    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); "
+    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM); "
     code += "s.bind(sys.argv[1]); s.listen(); print(flush=True); time.sleep(1000)"
     bridge = subprocess.Popen(
         [sys.executable, "-c", code, str(runs_root / "bridge.node.stop")], stdout=subprocess.PIPE
@@ -279,14 +266,127 @@ def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path
         bridge.communicate()
 
 
+class Receiver:
+    """A socket for e-stops of which a thread accepts connections only when it is started."""
+
+    def __init__(self, file: Path, backlog: int = 10) -> None:
+        self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.listener.bind(str(file))
+        self.listener.listen(backlog)
+        self.may_answer = threading.Event()
+        self.thread = threading.Thread(target=self._answer, daemon=True)
+
+    def fill(self) -> list[socket.socket]:
+        """Connect until the backlog is full, and return the connections."""
+        held = []
+        while True:
+            held.append(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK))
+            try:
+                held[-1].connect(self.listener.getsockname())
+            except BlockingIOError:
+                return held
+            held[-1].shutdown(socket.SHUT_WR)
+
+    def _answer(self) -> None:
+        self.may_answer.wait(DEADLINE_S)
+        while True:
+            connection, _ = self.listener.accept()
+            with connection:
+                if connection.recv(1000):
+                    connection.send(ANSWER)
+                    return
+
+
+def test_a_receiver_with_a_full_backlog_is_present(runs_root: Path) -> None:
+    receiver = Receiver(runs_root / f"launch.launcher{SUFFIX}", backlog=0)
+    held = receiver.fill()
+    attempts = stop_arms([runs_root], REASON)
+    assert [(one.path, one.outcome) for one in attempts] == [
+        (StopPath.LAUNCHER, StopOutcome.SILENT)
+    ]
+    for one in (*held, receiver.listener):
+        one.close()
+
+
+def test_a_receiver_is_told_as_soon_as_its_backlog_is_not_full(
+    runs_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stopping, "CONTINUE_AFTER_S", DEADLINE_S)
+    receiver = Receiver(runs_root / f"launch.launcher{SUFFIX}", backlog=0)
+    held = receiver.fill()
+    connect, calls = stopping._Receiver.connect, [receiver.may_answer.set, lambda: None]
+
+    def connect_later(one: Any) -> bool:
+        if calls:
+            calls.pop()()
+        return connect(one)
+
+    monkeypatch.setattr(stopping._Receiver, "connect", connect_later)
+    receiver.thread.start()
+    attempts = stop_arms([runs_root], REASON)
+    assert [one.outcome for one in attempts] == [StopOutcome.CONFIRMED]
+    receiver.thread.join()
+    for one in (*held, receiver.listener):
+        one.close()
+
+
+def test_a_bridge_with_a_full_backlog_is_killed_where_no_launcher_answers(
+    runs_root: Path,
+) -> None:
+    plan = {"nodes": {"bridge": {"outputs": [], "process": "arm"}}}
+    (runs_root / "plan.json").write_text(json.dumps(plan))
+    receiver = Receiver(runs_root / f"bridge.node{SUFFIX}", backlog=0)
+    held = receiver.fill()
+    code = "import time; print(flush=True); time.sleep(1000)"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(runs_root / "arm.json")], stdout=subprocess.PIPE
+    ) as bridge:
+        assert bridge.stdout is not None
+        bridge.stdout.readline()
+        attempts = stop_arms([runs_root], REASON)
+        bridge.kill()
+    assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
+        (StopPath.SIGNAL, "bridge", StopOutcome.KILLED)
+    ]
+    for one in (*held, receiver.listener):
+        one.close()
+
+
+def test_each_answer_is_timed_when_it_arrives(
+    runs_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second receiver answers only after the answer of the first one was noted."""
+    monkeypatch.setattr(stopping, "CONTINUE_AFTER_S", DEADLINE_S)
+    first, second = (
+        Receiver(runs_root / f"{name}{SUFFIX}") for name in ("launch.launcher", "bridge.node")
+    )
+
+    def note(*values: Any) -> StopAttempt:
+        second.may_answer.set()
+        return StopAttempt(*values)
+
+    monkeypatch.setattr(stopping, "StopAttempt", note)
+    first.may_answer.set()
+    for one in (first, second):
+        one.thread.start()
+    attempts = stop_arms([runs_root], REASON)
+    assert [(one.receiver, one.outcome) for one in attempts] == [
+        ("launch", StopOutcome.CONFIRMED),
+        ("bridge", StopOutcome.CONFIRMED),
+    ]
+    for one in (first, second):
+        one.thread.join()
+        one.listener.close()
+
+
 def test_the_answer_of_one_graph_spares_no_bridge_of_another(tmp_path: Path) -> None:
     """Each graph is stopped as if it were the only one."""
     answering, hanging = tmp_path / "a", tmp_path / "b"
     answering.mkdir()
     hanging.mkdir()
-    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); "
+    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM); "
     code += "s.bind(sys.argv[1]); s.listen(); print(flush=True); "
-    answer = f"c, _ = s.accept(); c.recv(1000); c.send({stop_socket.ANSWER!r}); "
+    answer = f"c, _ = s.accept(); c.recv(1000); c.send({ANSWER!r}); "
     started = [
         subprocess.Popen(
             [sys.executable, "-c", code + more + "time.sleep(1000)", str(file)],

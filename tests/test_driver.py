@@ -122,7 +122,7 @@ async def test_frames_without_an_image_end_the_wait_at_last(
         await asyncio.wait_for(capture, DEADLINE_S)
 
 
-def host(load_ratio: float) -> HostStatus:
+def host(load_ratio: float = 0.5) -> HostStatus:
     return HostStatus(
         host="main", run="1", plan_hash="", code="", python="3.11", uptime_s=1.0,
         disk_free_bytes=0, memory_free_bytes=0, nodes=(), missing_devices=(),

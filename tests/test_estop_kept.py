@@ -78,10 +78,10 @@ class Launchers:
         self._epoch, self._sequence = self._clock.now_ns(), 0
         for host in self.plan.hosts:
             self.agents[host] = HostAgent(
-                self.plan, host, run=Run("1", self.folder), code="", processes=tuple, pids=dict,
+                self.plan, host, run=Run("1", self.folder), code="", processes=tuple,
                 keys=None, on_problem=self.printed.append,
             )  # fmt: skip
-            self.agents[host].start()
+            await self.agents[host].start()
         writer = self.plan.writer("estop", "tools")
         assert writer is not None
         self._tool = Publisher(find_topic("estop"), [self._near(one) for one in writer.endpoints])

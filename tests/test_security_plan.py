@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.keys import KEYS_VARIABLE, make_rings
-from flexsheet.launch.running.supervisor import node_config
+from flexsheet.launch.running.node_config import node_config
 from flexsheet.messages import bus
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Publisher, Source
@@ -163,12 +163,14 @@ class SecuredBridge:
         assert (writer, repr(message)) not in self.inbox
 
 
-@contextmanager
-def make_secured(plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch) -> Iterator[SecuredBridge]:
+@asynccontextmanager
+async def make_secured(
+    plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[SecuredBridge]:
     monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
     secured = SecuredBridge(plan)
     monkeypatch.setattr(secured.bridge, "deliver", secured.record)
-    secured.links.open_inputs(secured.bridge)
+    await secured.links.open_inputs(secured.bridge)
     try:
         yield secured
     finally:
@@ -181,7 +183,7 @@ async def test_an_arm_s_computer_cannot_command_the_other_arm(
     """The attacker has the key and the address of the host `left`, and any free address."""
     mine, main_s = ("arm_left", "arm_left_bridge"), ("sheet_target", "planner")
     left, forged = arm_state("left"), target()
-    with make_secured(lab(folder), monkeypatch) as secured:
+    async with make_secured(lab(folder), monkeypatch) as secured:
         with secured.sender("arm_left", at=mine, key="left") as sender:
             await secured.is_taken(sender, "arm_left_bridge", left)
             for other in ("planner", BRIDGE, "tools"):
@@ -204,7 +206,7 @@ async def test_who_may_reset_a_stop_and_let_the_arms_move(
     """A console on the host `left` can always stop the arms. The launch file defines all other
     permissions.
     """
-    with make_secured(lab(folder, may_reset_estop=may), monkeypatch) as secured:
+    async with make_secured(lab(folder, may_reset_estop=may), monkeypatch) as secured:
         words: tuple[tuple[str, Message, Message], ...] = (
             ("estop", EStop(engaged=True, reason="a hand"), EStop(engaged=False, reason="gone")),
             ("arming", Arming(ready=False), Arming(ready=True)),

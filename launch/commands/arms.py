@@ -320,11 +320,11 @@ class _Arms:
         try:
             self._writer = GraphWriter(self._plan, self._run, ["estop"])
             self._writer.publish("estop", estop)
+            after_ms = 1e3 * (self._loop.time() - begun_s)
             # Wait until a launcher, which stores the e-stop, has had time to connect.
             await asyncio.sleep(READER_RECONNECT_S)
         except BusError:
-            outcome = StopOutcome.REFUSED
-        after_ms = 1e3 * (self._loop.time() - begun_s)
+            outcome, after_ms = StopOutcome.REFUSED, 1e3 * (self._loop.time() - begun_s)
         return StopAttempt(self._run.directory, StopPath.TOPIC, "estop", outcome, after_ms)
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:

@@ -104,9 +104,9 @@ class HostAgent:
         nodes = plan.nodes_on(host)
         self._devices, self._folder = list_device_files(nodes), find_recording_folder(nodes)
 
-    def start(self) -> None:
-        """Subscribe to e-stops and start to publish. An event loop must be running."""
-        self._stop_socket.open()
+    async def start(self) -> None:
+        """Subscribe to e-stops and start to publish."""
+        await self._stop_socket.open()
         stored = None if self._file is None else self._file.read()
         if stored is not None:
             self._on_problem(

@@ -21,19 +21,25 @@ import os
 import select
 import signal
 import socket
+import struct
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 from flexsheet.launch.running.runs import list_live_runs
-from flexsheet.nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, read_peer
+from flexsheet.nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX
 
 CONTINUE_AFTER_S = 0.06
 KILL_AFTER_S = 0.15
 DEFAULT_REASON = "flexsheet arms stop"
 TARGET_TOPIC = "sheet_target"
+RETRY_S = 0.005
+"""The time (s) after which a connection to a receiver with a full backlog is tried again."""
+
+_PEER = struct.Struct("3i")
+"""The format of SO_PEERCRED: process, user and group."""
 
 
 class StopPath(StrEnum):
@@ -68,7 +74,7 @@ class StopOutcome(StrEnum):
 class StopAttempt:
     """An attempt to stop the arms of the graph in the run directory `run`.
 
-    after_ms: time from the first request to the outcome.
+    after_ms: time from the first request to the answer of this receiver, or to the last attempt.
     """
 
     run: Path
@@ -83,13 +89,56 @@ class StopAttempt:
         return self.outcome in (StopOutcome.CONFIRMED, StopOutcome.KILLED)
 
 
-@dataclass(slots=True)
 class _Receiver:
-    run: Path
-    path: StopPath
-    name: str
-    connection: socket.socket
-    process: int
+    """A launcher or a node that receives an e-stop on its unix socket.
+
+    If the backlog of the socket is full, the receiver is present, but `connection` is None.
+    """
+
+    def __init__(self, file: Path, request: bytes) -> None:
+        self.run, self._file, self._request = file.parent, file, request
+        self.name, _, kind = file.stem.rpartition(".")
+        self.path = StopPath(kind)
+        self.connection: socket.socket | None = None
+
+    def connect(self) -> bool:
+        """Connect and send the request. Return False if no process listens."""
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            connection.connect(os.fspath(self._file))
+            connection.send(self._request)
+        except BlockingIOError:
+            connection.close()
+            return True
+        except OSError:
+            connection.close()
+            return False
+        self.connection = connection
+        return True
+
+    def read_answer(self) -> bool:
+        """Return whether the receiver has confirmed the stop."""
+        assert self.connection is not None
+        try:
+            return self.connection.recv(len(ANSWER)) == ANSWER
+        except ConnectionError:
+            return False
+
+    def close(self) -> None:
+        if self.connection is not None:
+            self.connection.close()
+
+    def find_process(self) -> int:
+        """Return the id of the receiver's process, or 0 if it is unknown."""
+        if self.connection is not None:
+            size = _PEER.size
+            packed = self.connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
+            process: int = _PEER.unpack(packed)[0]
+            return process
+        if self.path is StopPath.LAUNCHER:
+            launcher = self.run.name.partition(".")[0]
+            return int(launcher) if launcher.isdigit() else 0
+        return next((process for _, process in _find_nodes(self.run, self.name)), 0)
 
 
 def send_early(arguments: Sequence[str]) -> None:
@@ -132,109 +181,97 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
         after_ms = (time.monotonic() - started_s) * 1e3
         attempts.append(StopAttempt(run, path, receiver, outcome, after_ms))
 
-    request = (REQUEST + reason.encode())[:MAX_REQUEST_BYTES]
+    text = reason.encode().replace(b"\n", b" ")
+    request = (REQUEST + text)[: MAX_REQUEST_BYTES - 1] + b"\n"
     directories = list(runs)
     waiting: list[_Receiver] = []
-    for run, file in ((one, file) for one in directories for file in one.glob(f"*{SUFFIX}")):
-        name, _, kind = file.stem.rpartition(".")
-        connection = _send_request(file, request)
-        if connection is None:
-            note(run, StopPath(kind), name, StopOutcome.ABSENT)
+    for file in (file for run in directories for file in run.glob(f"*{SUFFIX}")):
+        receiver = _Receiver(file, request)
+        if receiver.connect():
+            waiting.append(receiver)
         else:
-            process, _ = read_peer(connection)
-            waiting.append(_Receiver(run, StopPath(kind), name, connection, process))
+            note(receiver.run, receiver.path, receiver.name, StopOutcome.ABSENT)
     try:
         for until_s, signalled in ((CONTINUE_AFTER_S, signal.SIGCONT), (KILL_AFTER_S, None)):
             for receiver in _await_answers(waiting, started_s + until_s):
                 note(receiver.run, receiver.path, receiver.name, StopOutcome.CONFIRMED)
             for receiver in waiting if signalled else ():
-                _send_signal(receiver.process, signalled or 0)
+                _send_signal(receiver.find_process(), signalled or 0)
         # If the launcher stores the stop, a suspended bridge need not be killed. It commands no
         # arm, and receives the stop when it resumes.
         latched = {one.run for one in attempts if one.path is StopPath.LAUNCHER and one.worked}
         for receiver in waiting:
             kill = receiver.path is StopPath.NODE and receiver.run not in latched
-            if kill and _send_signal(receiver.process, signal.SIGKILL):
+            if kill and _send_signal(receiver.find_process(), signal.SIGKILL):
                 note(receiver.run, StopPath.SIGNAL, receiver.name, StopOutcome.KILLED)
             else:
                 note(receiver.run, receiver.path, receiver.name, StopOutcome.SILENT)
     finally:
         for receiver in waiting:
-            receiver.connection.close()
+            receiver.close()
     confirmed = {one.run for one in attempts if one.outcome is StopOutcome.CONFIRMED}
     for run in (one for one in directories if one not in confirmed):
-        for name in _kill_target_senders(run):
-            note(run, StopPath.SIGNAL, name, StopOutcome.KILLED)
+        for name, process in _find_nodes(run):
+            if _send_signal(process, signal.SIGKILL):
+                note(run, StopPath.SIGNAL, name, StopOutcome.KILLED)
     return attempts
 
 
-def _send_request(file: Path, request: bytes) -> socket.socket | None:
-    """Send a request to the socket `file`, and return the connection for the answer.
+def _await_answers(waiting: list[_Receiver], until_s: float) -> Iterator[_Receiver]:
+    """Yield the receivers that confirm an e-stop until `until_s`, each as soon as it does.
 
-    Returns None if no process listens.
-    """
-    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-    try:
-        connection.connect(os.fspath(file))
-        connection.send(request)
-    except OSError:
-        connection.close()
-        return None
-    return connection
-
-
-def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Wait until `until_s` for confirmations of an emergency stop.
-
-    The receivers are launchers and nodes that control an arm. The receivers that confirm the stop
-    are removed from `waiting` and returned.
+    The receivers are launchers and nodes that control an arm. Those that confirm the stop are
+    removed from `waiting`. A full backlog of a receiver is tried again every RETRY_S.
 
     until_s: time of the monotonic clock, s.
     """
-    confirmed = []
-    poll = select.poll()
-    by_number = {one.connection.fileno(): one for one in waiting}
-    for number in by_number:
-        poll.register(number, select.POLLIN)
-    while by_number and (left_s := until_s - time.monotonic()) > 0:
+    silent: list[_Receiver] = []
+    while (left_s := until_s - time.monotonic()) > 0 and len(waiting) > len(silent):
+        poll = select.poll()
+        by_number: dict[int, _Receiver] = {}
+        for receiver in waiting:
+            if receiver.connection is None:
+                receiver.connect()
+            if receiver.connection is None:
+                left_s = min(left_s, RETRY_S)
+            elif receiver not in silent:
+                by_number[receiver.connection.fileno()] = receiver
+                poll.register(receiver.connection, select.POLLIN)
         for number, _ in poll.poll(left_s * 1e3):
-            receiver = by_number.pop(number)
-            poll.unregister(number)
-            try:
-                answer = receiver.connection.recv(len(ANSWER))
-            except ConnectionError:
-                answer = b""
-            if answer == ANSWER:
-                confirmed.append(receiver)
+            receiver = by_number[number]
+            if receiver.read_answer():
                 waiting.remove(receiver)
-                receiver.connection.close()
-    return confirmed
+                receiver.close()
+                yield receiver
+            else:
+                silent.append(receiver)
 
 
-def _kill_target_senders(run: Path) -> list[str]:
-    """Kill the nodes that publish sheet targets in a run.
+def _find_nodes(run: Path, name: str | None = None) -> list[tuple[str, int]]:
+    """Return the names and process ids of nodes of a run.
 
-    Returns the names of the killed nodes.
+    name: name of the node. If it is None, the nodes that publish sheet targets are returned.
     """
     try:
         nodes = json.loads((run / "plan.json").read_text())["nodes"]
     except (OSError, ValueError, KeyError):
         return []
-    senders = {
-        os.fsencode(run / f"{node.get('process') or name}.json"): name
-        for name, node in nodes.items()
-        if any(port["topic"] == TARGET_TOPIC for port in node["outputs"])
+    wanted = {
+        os.fsencode(run / f"{node.get('process') or one}.json"): one
+        for one, node in nodes.items()
+        if one == name
+        or (name is None and any(port["topic"] == TARGET_TOPIC for port in node["outputs"]))
     }
-    killed = []
+    found = []
     for entry in Path("/proc").glob("[0-9]*/cmdline"):
         try:
-            named = senders.keys() & set(entry.read_bytes().split(b"\0"))
+            named = wanted.keys() & set(entry.read_bytes().split(b"\0"))
         except OSError:
             # The process has ended, or belongs to another user.
             continue
-        if named and _send_signal(int(entry.parent.name), signal.SIGKILL):
-            killed.append(senders[named.pop()])
-    return killed
+        if named:
+            found.append((wanted[named.pop()], int(entry.parent.name)))
+    return found
 
 
 def _send_signal(process: int, number: int) -> bool:

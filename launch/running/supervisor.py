@@ -143,7 +143,7 @@ class RunningGraph:
 
     async def __aenter__(self) -> Self:
         try:
-            self._start()
+            await self._start()
         except BaseException:
             await self.stop()
             raise
@@ -290,7 +290,7 @@ class RunningGraph:
                 self._send(number, alive)
                 await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
 
-    def _start(self) -> None:
+    async def _start(self) -> None:
         _check_network(self.plan, self._host)
         swept = sweep()
         self._run = create_run()
@@ -316,7 +316,7 @@ class RunningGraph:
                 on_problem=partial(self._report, LAUNCHER),
             )
             self._agents.append(agent)
-            agent.start()
+            await agent.start()
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
         for omitted in self.plan.omitted:
             self._report(LAUNCHER, f"{omitted.name} is not started: {REASON_TEXTS[omitted.reason]}")
