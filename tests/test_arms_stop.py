@@ -13,6 +13,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -246,46 +247,40 @@ def test_a_socket_of_the_dead_is_absent_and_a_silent_launcher_is_not_killed(
     }
 
 
-def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path) -> None:
+@contextmanager
+def socket_process(file: Path, more: str = "") -> Iterator[subprocess.Popen[bytes]]:
+    """Start a process with a socket for e-stops that runs the code `more` and then hangs."""
     code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM); "
-    code += "s.bind(sys.argv[1]); s.listen(); print(flush=True); time.sleep(1000)"
-    bridge = subprocess.Popen(
-        [sys.executable, "-c", code, str(runs_root / "bridge.node.stop")], stdout=subprocess.PIPE
-    )
+    code += f"s.bind(sys.argv[1]); s.listen(0); print(flush=True); {more}time.sleep(1000)"
+    process = subprocess.Popen([sys.executable, "-c", code, str(file)], stdout=subprocess.PIPE)
     try:
-        assert bridge.stdout is not None
-        bridge.stdout.readline()
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path) -> None:
+    with socket_process(runs_root / "bridge.node.stop") as bridge:
         bridge.send_signal(signal.SIGSTOP)
         attempts = stop_arms([runs_root], REASON)
         assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
             (StopPath.SIGNAL, "bridge", StopOutcome.KILLED)
         ]
         assert bridge.wait(DEADLINE_S) == -signal.SIGKILL
-    finally:
-        bridge.kill()
-        bridge.communicate()
 
 
 class Receiver:
     """A socket for e-stops of which a thread accepts connections only when it is started."""
 
-    def __init__(self, file: Path, backlog: int = 10) -> None:
+    def __init__(self, file: Path) -> None:
         self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.listener.bind(str(file))
-        self.listener.listen(backlog)
+        self.listener.listen(0)
         self.may_answer = threading.Event()
         self.thread = threading.Thread(target=self._answer, daemon=True)
-
-    def fill(self) -> list[socket.socket]:
-        """Connect until the backlog is full, and return the connections."""
-        held = []
-        while True:
-            held.append(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK))
-            try:
-                held[-1].connect(self.listener.getsockname())
-            except BlockingIOError:
-                return held
-            held[-1].shutdown(socket.SHUT_WR)
 
     def _answer(self) -> None:
         self.may_answer.wait(DEADLINE_S)
@@ -297,23 +292,24 @@ class Receiver:
                     return
 
 
-def test_a_receiver_with_a_full_backlog_is_present(runs_root: Path) -> None:
-    receiver = Receiver(runs_root / f"launch.launcher{SUFFIX}", backlog=0)
-    held = receiver.fill()
-    attempts = stop_arms([runs_root], REASON)
-    assert [(one.path, one.outcome) for one in attempts] == [
-        (StopPath.LAUNCHER, StopOutcome.SILENT)
-    ]
-    for one in (*held, receiver.listener):
-        one.close()
+def fill_backlog(file: Path) -> list[socket.socket]:
+    """Connect to a socket until its backlog is full, and return the connections."""
+    held = []
+    while True:
+        held.append(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK))
+        try:
+            held[-1].connect(str(file))
+        except BlockingIOError:
+            return held
+        held[-1].shutdown(socket.SHUT_WR)
 
 
 def test_a_receiver_is_told_as_soon_as_its_backlog_is_not_full(
     runs_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stopping, "CONTINUE_AFTER_S", DEADLINE_S)
-    receiver = Receiver(runs_root / f"launch.launcher{SUFFIX}", backlog=0)
-    held = receiver.fill()
+    receiver = Receiver(runs_root / f"launch.launcher{SUFFIX}")
+    held = fill_backlog(runs_root / f"launch.launcher{SUFFIX}")
     connect, calls = stopping._Receiver.connect, [receiver.may_answer.set, lambda: None]
 
     def connect_later(one: Any) -> bool:
@@ -330,25 +326,19 @@ def test_a_receiver_is_told_as_soon_as_its_backlog_is_not_full(
         one.close()
 
 
-def test_a_bridge_with_a_full_backlog_is_killed_where_no_launcher_answers(
-    runs_root: Path,
-) -> None:
-    plan = {"nodes": {"bridge": {"outputs": [], "process": "arm"}}}
+def test_a_bridge_with_a_full_backlog_is_killed_where_no_launcher_answers(runs_root: Path) -> None:
+    plan = {"nodes": {"bridge": {"outputs": [], "process": f"bridge.node{SUFFIX}"}}}
     (runs_root / "plan.json").write_text(json.dumps(plan))
-    receiver = Receiver(runs_root / f"bridge.node{SUFFIX}", backlog=0)
-    held = receiver.fill()
-    code = "import time; print(flush=True); time.sleep(1000)"
-    with subprocess.Popen(
-        [sys.executable, "-c", code, str(runs_root / "arm.json")], stdout=subprocess.PIPE
-    ) as bridge:
-        assert bridge.stdout is not None
-        bridge.stdout.readline()
+    # The process is found by its argument, the path of its configuration.
+    with socket_process(runs_root / f"bridge.node{SUFFIX}.json") as bridge:
+        (runs_root / f"bridge.node{SUFFIX}.json").rename(runs_root / f"bridge.node{SUFFIX}")
+        held = fill_backlog(runs_root / f"bridge.node{SUFFIX}")
         attempts = stop_arms([runs_root], REASON)
-        bridge.kill()
-    assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
-        (StopPath.SIGNAL, "bridge", StopOutcome.KILLED)
-    ]
-    for one in (*held, receiver.listener):
+        assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
+            (StopPath.SIGNAL, "bridge", StopOutcome.KILLED)
+        ]
+        assert bridge.wait(DEADLINE_S) == -signal.SIGKILL
+    for one in held:
         one.close()
 
 
@@ -384,32 +374,16 @@ def test_the_answer_of_one_graph_spares_no_bridge_of_another(tmp_path: Path) -> 
     answering, hanging = tmp_path / "a", tmp_path / "b"
     answering.mkdir()
     hanging.mkdir()
-    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM); "
-    code += "s.bind(sys.argv[1]); s.listen(); print(flush=True); "
     answer = f"c, _ = s.accept(); c.recv(1000); c.send({ANSWER!r}); "
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-c", code + more + "time.sleep(1000)", str(file)],
-            stdout=subprocess.PIPE,
-        )
-        for more, file in (
-            (answer, answering / "launch.launcher.stop"),
-            ("", hanging / "bridge.node.stop"),
-        )
-    ]
-    try:
-        for process in started:
-            assert process.stdout is not None
-            process.stdout.readline()
+    with (
+        socket_process(answering / "launch.launcher.stop", answer),
+        socket_process(hanging / "bridge.node.stop"),
+    ):
         attempts = stop_arms([answering, hanging], REASON)
         assert {(one.run, one.receiver, one.outcome) for one in attempts} == {
             (answering, "launch", StopOutcome.CONFIRMED),
             (hanging, "bridge", StopOutcome.KILLED),
         }
-    finally:
-        for process in started:
-            process.kill()
-            process.communicate()
 
 
 @pytest.mark.parametrize("process", ["planner", "tracking"])

@@ -146,10 +146,3 @@ def test_real_time_applies_to_all_threads_except_workers_that_leave_it() -> None
         before, inherited, left = process.submit(policies_in_real_time).result()
     assert before == {os.SCHED_RR}
     assert (inherited, left) == (os.SCHED_RR, os.SCHED_OTHER)
-
-
-def test_a_thread_without_real_time_keeps_its_policy() -> None:
-    with ThreadPoolExecutor(1) as worker:
-        worker.submit(os.sched_setscheduler, 0, os.SCHED_BATCH, os.sched_param(0)).result()
-        worker.submit(leave_real_time).result()
-        assert worker.submit(os.sched_getscheduler, 0).result() == os.SCHED_BATCH

@@ -22,10 +22,10 @@ import zmq
 from flexsheet.launch.plans.hosts import clock_node, launcher_on
 from flexsheet.launch.plans.plan_model import ArmingMode, ResolvedGraph, ResolvedNode, tools_on
 from flexsheet.launch.running.estop_file import EStopFile
-from flexsheet.launch.running.runs import Run, local_endpoints, local_sources
+from flexsheet.launch.running.runs import Run, local_sources
+from flexsheet.launch.running.tools import TopicWriters
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.bus import Handler, Publisher, Source, Subscriber
-from flexsheet.messages.clock import Clock, SystemClock
+from flexsheet.messages.bus import Handler, Source, Subscriber
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import find_topic
@@ -38,7 +38,7 @@ from flexsheet.messages.types import (
     NodeProcess,
 )
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.node import Output, PortCounts
+from flexsheet.nodes.node import PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
@@ -49,6 +49,8 @@ RESET_WITHIN_S = 5.0
 """The time (s) in which all arms must confirm the reset of an e-stop."""
 
 ARMS = ("arm_left", "arm_right")
+TOPICS = ("host", "estop", "scene", "twin/apparatus")
+"""The topics that the launcher publishes if it is a writer of them."""
 
 
 class HostAgent:
@@ -73,24 +75,14 @@ class HostAgent:
     ) -> None:
         self._plan, self._host, self._run, self._code = plan, host, run, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
-        self._clock = SystemClock()
-        self._name, self._epoch = launcher_on(host), self._clock.now_ns()
+        self._name = launcher_on(host)
         # Launchers repeat the e-stop, so a restarted launcher gets it from the other launchers.
         self._launchers = {launcher_on(name) for name in plan.hosts}
-        self.publishers: dict[str, Publisher] = {}
-        self._outputs: dict[str, Output[Message]] = {}
-        for topic in ("host", "estop"):
-            writer = plan.writer(topic, self._name)
-            if writer is not None:
-                self.publishers[topic] = publisher = Publisher(
-                    find_topic(topic),
-                    local_endpoints(run, writer.endpoints),
-                    keys=keys,
-                    on_refused=on_problem,
-                )
-                self._outputs[topic] = make_output(
-                    publisher, self._clock, writer=self._name, epoch=self._epoch, plan=plan.hash
-                )
+        writers = {topic: plan.writer(topic, self._name) for topic in TOPICS}
+        self._writable = {topic: one for topic, one in writers.items() if one is not None}
+        self._writers = TopicWriters(plan, run, self._writable, keys, on_problem)
+        self._clock = self._writers.clock
+        self._begun_ns = self._clock.now_ns()
         self._clock_table = ClockTable(self._clock.id)
         self._subscribers: list[Subscriber] = []
         self._task: asyncio.Task[None] | None = None
@@ -152,8 +144,7 @@ class HostAgent:
                 await asyncio.gather(task, return_exceptions=True)
         for subscriber in self._subscribers:
             subscriber.close()
-        for publisher in self.publishers.values():
-            publisher.close()
+        self._writers.close()
 
     def _stop(self, reason: str) -> None:
         """Engage an e-stop that `flexsheet arms stop` has sent through the local socket."""
@@ -187,7 +178,7 @@ class HostAgent:
         before = self._latched
         self._latched = EStop(engaged=True, reason=estop.reason[:REASON_LENGTH])
         self._engaged_ns = max(self._engaged_ns, at_ns)
-        self._publish("estop", self._latched)
+        self.publish("estop", self._latched)
         if before != self._latched:
             self._update_file()
 
@@ -227,7 +218,7 @@ class HostAgent:
         else:
             self._on_problem(f"e-stop reset by {writer}")
             self._latched = None
-            self.publishers["estop"].forget()
+            self._writers.forget("estop")
             self._update_file()
 
     def _update_file(self) -> None:
@@ -250,14 +241,19 @@ class HostAgent:
         else:
             self._file_outdated = False
 
-    def _publish(self, topic: str, message: Message) -> None:
-        if topic in self._outputs:
-            self._outputs[topic].publish(message)
+    def publish(self, topic: str, message: Message | None) -> int | None:
+        """Publish a message, and return its source timestamp (ns).
+
+        Returns None if there is no message, or if the launcher is not a writer of the topic.
+        """
+        if message is None or topic not in self._writable:
+            return None
+        return self._writers.publish(topic, message).source_ns
 
     async def _publish_loop(self) -> None:
         while True:
             try:
-                self._publish("host", self._status())
+                self.publish("host", self._status())
             except OSError as error:
                 problem = f"the status of this host cannot be read: {error}"
                 if problem != self._status_error:
@@ -275,7 +271,7 @@ class HostAgent:
             plan_hash=self._plan.hash,
             code=self._code,
             python=python_version(),
-            uptime_s=(self._clock.now_ns() - self._epoch) * 1e-9,
+            uptime_s=(self._clock.now_ns() - self._begun_ns) * 1e-9,
             load_ratio=os.getloadavg()[0] / (os.cpu_count() or 1),
             disk_free_bytes=disk.f_bavail * disk.f_frsize,
             memory_free_bytes=psutil.virtual_memory().available,
@@ -296,20 +292,6 @@ class HostAgent:
 
 def _describe_estop(writer: str, reason: str) -> str:
     return f"e-stop of {writer}, latched until it is reset: {reason}"
-
-
-def make_output(
-    publisher: Publisher, clock: Clock, *, writer: str, epoch: int, plan: str
-) -> Output[Message]:
-    """Return an output that adds sequence numbers and timestamps to messages and publishes them."""
-    return Output(
-        publisher.topic,
-        clock,
-        lambda _, message, header: publisher.send(message, header),
-        writer=writer,
-        epoch=epoch,
-        plan=plan,
-    )
 
 
 def has_estop(state: ArmState) -> bool:

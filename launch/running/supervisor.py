@@ -39,7 +39,7 @@ from flexsheet.launch.plans.plan_model import (
 from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from flexsheet.launch.running.child_process import Child, Report
 from flexsheet.launch.running.commit import read_commit
-from flexsheet.launch.running.host import HostAgent, make_output
+from flexsheet.launch.running.host import HostAgent
 from flexsheet.launch.running.keys import make_rings
 from flexsheet.launch.running.node_config import node_config
 from flexsheet.launch.running.priority import (
@@ -53,20 +53,13 @@ from flexsheet.launch.running.runs import (
     Run,
     create_run,
     is_free,
-    local_endpoints,
     sweep,
 )
-from flexsheet.messages.base import Message
-from flexsheet.messages.bus import Publisher
-from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.security import KeyRing
-from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.node import Output
 from flexsheet.nodes.runner import ProcessConfig
 
 STOP_GRACE_S = 3.0
@@ -110,11 +103,7 @@ class RunningGraph:
         self._children: dict[str, Child] = {}
         self._supervisors: dict[str, asyncio.Task[None]] = {}
         self._ready = {node.name: asyncio.Event() for node in self.nodes}
-        self._publishers: dict[str, Publisher] = {}
-        self._outputs: dict[str, Output[Message]] = {}
-        self._epoch_ns = 0
-        self._agents: list[HostAgent] = []
-        self._rings: dict[str, KeyRing] = {}
+        self._agents: dict[str, HostAgent] = {}
         self._lifeline: tuple[int, int] | None = None
 
     @property
@@ -255,10 +244,7 @@ class RunningGraph:
             for name, child in self._children.items():
                 child.kill_now()
                 self._set_exit_code(self._processes[name], child.exited.result())
-            for publisher in self._publishers.values():
-                publisher.close()
-            self._publishers.clear()
-            for agent in self._agents:
+            for agent in self._agents.values():
                 await agent.close()
             if self._lifeline is not None:
                 for fd in self._lifeline:
@@ -298,25 +284,23 @@ class RunningGraph:
             self._report(LAUNCHER, f"ended {len(swept)} processes of earlier launchers")
         self._lifeline = os.pipe()
         _check_ports(self.plan, self._host)
-        if self.plan.keys:
-            self._rings = make_rings(self.plan, self.run, self._host)
+        rings = make_rings(self.plan, self.run, self._host) if self.plan.keys else {}
         commit = read_commit()
         self._write_run_files(commit)
-        if self._host in (None, MAIN):
-            self._publish_latched("scene", self.plan.scene_message())
-            self._publish_latched("twin/apparatus", self.plan.apparatus_message())
         for host in self.plan.hosts if self._host is None else [self._host]:
-            agent = HostAgent(
+            self._agents[host] = agent = HostAgent(
                 self.plan,
                 host,
                 run=self.run,
                 code=(commit or "unknown")[:12],
                 processes=partial(self._list_states, host),
-                keys=self._rings.get(host),
+                keys=rings.get(host),
                 on_problem=partial(self._report, LAUNCHER),
             )
-            self._agents.append(agent)
             await agent.start()
+            if host == MAIN:
+                agent.publish("scene", self.plan.scene_message())
+                agent.publish("twin/apparatus", self.plan.apparatus_message())
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
         for omitted in self.plan.omitted:
             self._report(LAUNCHER, f"{omitted.name} is not started: {REASON_TEXTS[omitted.reason]}")
@@ -330,35 +314,12 @@ class RunningGraph:
 
         Raises RuntimeError if a node of the graph, such as the console, publishes the scene.
         """
-        source_ns = self._publish_latched("scene", scene)
+        source_ns = self._agents[MAIN].publish("scene", scene) if MAIN in self._agents else None
         if source_ns is None:
             raise RuntimeError(
                 "a node of the graph publishes the scene; omit that node (--without NODE)"
             )
         return source_ns
-
-    def _publish_latched(self, topic: str, message: Message | None) -> int | None:
-        """Publish a message that later subscribers also receive.
-
-        Returns the source timestamp (ns) of the message. Returns None if there is no message, or if
-        the launcher is not a writer of the topic.
-        """
-        writer = self.plan.writer(topic, LAUNCHER)
-        if message is None or writer is None:
-            return None
-        if topic not in self._outputs:
-            self._publishers[topic] = publisher = Publisher(
-                find_topic(topic),
-                local_endpoints(self.run, writer.endpoints),
-                keys=self._rings.get(MAIN),
-                on_refused=partial(self._report, LAUNCHER),
-            )
-            clock = SystemClock()
-            self._epoch_ns = self._epoch_ns or clock.now_ns()
-            self._outputs[topic] = make_output(
-                publisher, clock, writer=LAUNCHER, epoch=self._epoch_ns, plan=self.plan.hash
-            )
-        return self._outputs[topic].publish(message).source_ns
 
     def _list_states(self, host: str) -> tuple[NodeProcess, ...]:
         pids = self.pids

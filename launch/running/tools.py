@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import AsyncIterator, Iterable
+import logging
+from collections.abc import AsyncIterator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -23,6 +24,8 @@ from flexsheet.messages.types import HostStatus, Status
 
 if TYPE_CHECKING:
     from flexsheet.launch.plans.documents import BadInputError
+
+_log = logging.getLogger("flexsheet.bus")
 
 READER_RECONNECT_S = 1.0
 """The time (s) in which all subscribers connect to a new writer.
@@ -141,7 +144,68 @@ def find_tool_writer(plan: ResolvedGraph, run: Run, topic: str) -> Writer:
     return writer
 
 
-class GraphWriter:
+class TopicWriters:
+    """Publishers of topics, which add sequence numbers and timestamps to the messages.
+
+    They require a running event loop.
+
+    writers: writers of the plan by topic name.
+    on_refused: function that is called with a text for each refused connection.
+
+    The constructor raises BusError if another process is already writing a topic.
+    """
+
+    def __init__(
+        self,
+        plan: ResolvedGraph,
+        run: Run,
+        writers: Mapping[str, Writer],
+        keys: KeyRing | None,
+        on_refused: Problem = _log.warning,
+    ) -> None:
+        self.clock = SystemClock()
+        self._epoch, self._plan, self._writers = self.clock.now_ns(), plan.hash, writers
+        self._sequences = dict.fromkeys(writers, 0)
+        self._publishers: dict[str, Publisher] = {}
+        try:
+            for name, writer in writers.items():
+                endpoints = local_endpoints(run, writer.endpoints)
+                self._publishers[name] = Publisher(
+                    find_topic(name), endpoints, keys=keys, on_refused=on_refused
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> Header:
+        """Send a message with the next sequence number, and return its header.
+
+        source_ns: source timestamp of the data. If it is None, the present time is used.
+        """
+        self._sequences[topic] += 1
+        now_ns = self.clock.now_ns()
+        header = Header(
+            sequence=self._sequences[topic],
+            source_ns=now_ns if source_ns is None else source_ns,
+            publish_ns=now_ns,
+            clock_id=self.clock.id,
+            writer=self._writers[topic].name,
+            epoch=self._epoch,
+            plan=self._plan,
+        )
+        self._publishers[topic].send(message, header)
+        return header
+
+    def forget(self, topic: str) -> None:
+        """Discard the message that is stored for late subscribers of a latched topic."""
+        self._publishers[topic].forget()
+
+    def close(self) -> None:
+        for publisher in self._publishers.values():
+            publisher.close()
+
+
+class GraphWriter(TopicWriters):
     """A publisher of topics for tools outside the running graph.
 
     It requires a running event loop.
@@ -151,44 +215,8 @@ class GraphWriter:
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
-        self._clock = SystemClock()
-        self._epoch, self._plan = self._clock.now_ns(), plan.hash
-        keys = load_tool_keys(plan, run)
-        self._sequences: dict[str, int] = {}
-        self._publishers: dict[str, Publisher] = {}
-        self._name = tools_on(tools_host(run))
-        try:
-            for name in topics:
-                writer = find_tool_writer(plan, run, name)
-                endpoints = local_endpoints(run, writer.endpoints)
-                self._publishers[name] = Publisher(find_topic(name), endpoints, keys=keys)
-        except BaseException:
-            self.close()
-            raise
-
-    def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
-        """Send a message with the next sequence number.
-
-        source_ns: source timestamp of the data. If it is None, the present time is used.
-        """
-        self._sequences[topic] = self._sequences.get(topic, 0) + 1
-        now_ns = self._clock.now_ns()
-        self._publishers[topic].send(
-            message,
-            Header(
-                sequence=self._sequences[topic],
-                source_ns=now_ns if source_ns is None else source_ns,
-                publish_ns=now_ns,
-                clock_id=self._clock.id,
-                writer=self._name,
-                epoch=self._epoch,
-                plan=self._plan,
-            ),
-        )
-
-    def close(self) -> None:
-        for publisher in self._publishers.values():
-            publisher.close()
+        writers = {name: find_tool_writer(plan, run, name) for name in topics}
+        super().__init__(plan, run, writers, load_tool_keys(plan, run))
 
 
 def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
