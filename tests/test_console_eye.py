@@ -73,7 +73,7 @@ def test_after_a_view_each_scene_has_its_own_correction_until_one_is_selected(
     scene: Scene, tmp_path: Path
 ) -> None:
     def corrected_by(correction: Correction | None) -> Scene:
-        return scene.model_copy(update={"methods": Methods(correction=correction)})
+        return scene.model_copy(update={"methods": Methods(correction=correction or "two_pass")})
 
     (tmp_path / "plan.json").write_text(
         f'{{"scene": {corrected_by("four_triangles").model_dump_json()}}}'
