@@ -23,14 +23,11 @@ import numpy as np
 
 from benchmarks.messaging import print_report
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
-from flexsheet.launch.health.compliance import (
-    LINEAR_DEPTH_M,
-    compute_compliance,
-    compute_front_curve,
-)
+from flexsheet.launch.health.compliance import compute_compliance, compute_front_curve
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_material
 from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.fem_solver.body import LINEAR_DEPTH_M
 from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
@@ -57,7 +54,8 @@ PLACES_MODULUS_PA = 3000.0
 
 def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
     """Compute the force-depth curve of the scene's object, divided by its Young's modulus."""
-    rows, modulus = compute_front_curve(scene), require_material(scene).young_modulus_pa
+    rows = compute_front_curve(scene, None, print)
+    modulus = require_material(scene).young_modulus_pa
     return lambda wanted: ObjectCurve.from_rows(rows * [1.0, wanted / modulus])
 
 

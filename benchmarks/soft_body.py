@@ -17,7 +17,6 @@ any skin node in a step, the stiffness, and the time of a step. Takes about a mi
 from __future__ import annotations
 
 import argparse
-import contextlib
 import resource
 import sys
 import tempfile
@@ -33,6 +32,7 @@ from benchmarks.messaging import print_report
 from flexsheet.launch.experiments.compliance import POSITIONS_M
 from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.methods import SoftBodyChoice
 from flexsheet.messages.scene import Scene, require_cylinder, require_material
 from flexsheet.nodes.arrays import Floats, Singles
 from flexsheet.nodes.cache import default_cache_dir
@@ -41,7 +41,7 @@ from flexsheet.nodes.fem_solver.closest_contact import ContactQuery, locate
 from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
-from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.fem_solver.soft_body_factory import load_body, prepare_body
 from flexsheet.nodes.fem_solver.table import TableSoftBody
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -101,7 +101,7 @@ def evaluate_table(scene: Scene, spacing_m: float, *, cold: bool) -> dict[str, A
         names = ("all", "nine_in_ten", "half")
         report["reach_mm"] = dict(zip(names, (1e3 * levels).tolist(), strict=True))
     report["force_errors"] = find_force_errors(
-        scene, {"linear": linear, "quick": make_quick(scene, linear), "table": best}
+        scene, {"linear": linear, "coarse": make_coarse(scene, spacing_m), "table": best}
     )
     mesh, radius_m = build_mesh(best.spec.mesh), require_cylinder(scene).radius_m
     report["pushes"] = []
@@ -133,38 +133,22 @@ def find_worst(pushes: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
 
 
 def load_bodies(
-    scene: Scene, spacing_m: float, cache_dir: Path
+    scene: Scene, spacing_m: float, cache_dir: Path, *, complete_table: bool = True
 ) -> tuple[body.SceneBody, body.SceneBody]:
     """Return the nonlinear and the linear body, computed or read from a cache."""
-    maker = SoftBodyFactory(
-        skin_spacing_m=spacing_m,
-        linear_depth_m=0.006,
-        max_depth_m=0.010,
-        friction_ratio=0.0,
-        cache_dir=cache_dir,
-        workers=0,
+    linear, table = (
+        SoftBodyChoice(method=method, skin_spacing_m=spacing_m)
+        for method in ("linear", "nonlinear_table")
     )
-    bodies = maker.bodies(scene, "auto", lambda *_: None)
-    if len(bodies) == 1:
-        bodies.insert(0, maker.build_table(scene, bodies[0], print_progress))
-    return bodies[0], bodies[1]
+    prepare_body(scene, table, cache_dir, print_progress, complete_table=complete_table)
+    best, other = (load_body(scene, one, cache_dir, print_progress) for one in (table, linear))
+    return best, other
 
 
-def make_quick(scene: Scene, linear: body.SceneBody) -> body.SceneBody:
-    """Compute the quick table of a scene, without the complete one."""
-    made: list[body.SceneBody] = []
-
-    def stop(quick: body.SceneBody) -> None:
-        made.append(quick)
-        raise precompute.Interrupted
-
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        contextlib.suppress(precompute.Interrupted),
-    ):
-        factory = SoftBodyFactory(linear.spec.mesh.skin_spacing_m, Path(folder))
-        factory.build_table(scene, linear, print_progress, stop)
-    return made[0]
+def make_coarse(scene: Scene, spacing_m: float) -> body.SceneBody:
+    """Compute the coarse table of a scene, without the complete one."""
+    with tempfile.TemporaryDirectory() as folder:
+        return load_bodies(scene, spacing_m, Path(folder), complete_table=False)[0]
 
 
 def find_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> list[dict[str, Any]]:
@@ -303,7 +287,7 @@ def measure(scene: Scene, spacing_m: float) -> dict[str, Any]:
             model = precompute.load_or_compute(spec, Path(folder), lambda *_: None)
             times.append(time.perf_counter())
     cold_s, warm_s = np.diff(times).tolist()
-    built = body.build_scene_body(scene, spec, model, linear_depth_m=0.006, max_depth_m=0.010)
+    built = body.build_scene_body(scene, spec, model)
     radius_m = require_cylinder(scene).radius_m
     return {
         "spacing_mm": 1e3 * spacing_m,

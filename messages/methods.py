@@ -7,13 +7,11 @@ methods unless a parameter of the launch file overrides them.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from flexsheet.messages.limits import LimitedModel
-
-T = TypeVar("T", bound=str | float)
 
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
@@ -37,20 +35,9 @@ class Methods(BaseModel):
 
     sheet_shape: SheetShapeMethod = "reduced_order"
     correction: Correction = "two_pass"
-    soft_body: SoftBodyChoice | None = None
+    soft_body: SoftBodyChoice = SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.003)
     compliance: ComplianceMode = Field(
         default="force_curve",
         description="how the sheet renders the object's force; stiffness: only by the stretch, as "
         "in Furukawa et al. 2007; constant_stretch: the force is not rendered",
     )
-
-
-def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: T) -> T:
-    """Return the method that a node uses.
-
-    parameter: value of the node's parameter; "auto" selects the scene's choice.
-    by_scene: choice of the scene; None means `default`.
-    """
-    if parameter != "auto":
-        return parameter
-    return default if by_scene is None else by_scene

@@ -41,6 +41,7 @@ class NoteCode(StrEnum):
     SHEET_SHAPE_INACCURATE = "sheet-shape-inaccurate"
     SOFT_BODY_COMPUTING = "soft-body-computing"
     SOFT_BODY_FAILED = "soft-body-failed"
+    SOFT_BODY_TABLE_MISSING = "soft-body-table-missing"
     SOURCE_ENDED = "source-ended"
     WINDOW = "window"
 
@@ -83,6 +84,7 @@ NOTE_REMEDIES: dict[NoteCode, str] = {
     NoteCode.SHEET_SHAPE_INACCURATE: "Run the command that is named, or push less deeply.",
     NoteCode.SOFT_BODY_COMPUTING: "Wait, or run `flexsheet precompute SCENE` before the start.",
     NoteCode.SOFT_BODY_FAILED: "Correct the named cause, and start the graph again.",
+    NoteCode.SOFT_BODY_TABLE_MISSING: "Stop the graph, and run the command that is named.",
     NoteCode.SOURCE_ENDED: "Start the graph again, or set `loop` of the parameter `source`.",
     NoteCode.WINDOW: "Set the size of the projector's mode in the scene; check its cable.",
 }

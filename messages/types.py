@@ -322,11 +322,7 @@ class SoftBody(Message):
     force_error_ratio: NonNegative = Field(
         default=0.0,
         description="relative error of the force at `push_depth_m`, as stated by the method; "
-        "while one method replaces another, the larger of both errors; 0: the error is unknown",
-    )
-    in_transition: bool = Field(
-        default=False,
-        description="true: `method` gradually replaces another method, which still contributes",
+        "0: the error is unknown",
     )
     displacement_world_m: Points3
 

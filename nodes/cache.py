@@ -42,13 +42,9 @@ def default_cache_dir() -> Path:
     return (Path(root) if root else Path.home() / ".cache") / "flexsheet"
 
 
-def advise_precompute(scene: Scene, options: str = "") -> str:
-    """Return a text that tells the user how to compute the missing tables of a scene.
-
-    options: further options of the command, which begin with a space.
-    """
-    command = f"flexsheet precompute SCENE{options}"
-    return f'with the file of the scene "{scene.name}" as SCENE, run {command}'
+def advise_precompute(scene: Scene) -> str:
+    """Return a text that tells the user how to compute the missing tables of a scene."""
+    return f'with the file of the scene "{scene.name}" as SCENE, run flexsheet precompute SCENE'
 
 
 def make_digest(value: object) -> str:

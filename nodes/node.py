@@ -554,13 +554,6 @@ class Node:
             exc_info=None if explained else error,
         )
 
-    def is_superseded(self, port: str) -> bool:
-        """Return whether a newer message waits for the coroutine handler of a port.
-
-        Any thread may call this method.
-        """
-        return bool(self._mailboxes[port].waiting)
-
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
         """Return the tasks in which coroutine handlers run."""
         return [box.task for box in self._mailboxes.values() if box.task is not None]

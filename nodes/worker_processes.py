@@ -24,6 +24,8 @@ def local_processes(count: int) -> Iterator[Executor]:
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     executor = ProcessPoolExecutor(count, context, initializer=_init_worker, initargs=(stop,))
+    # Each process computes with one thread, because more would compete with the other processes.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     try:
         yield executor
     except BaseException:

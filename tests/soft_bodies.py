@@ -20,7 +20,6 @@ def cylinder_spec(
     skin_spacing_m: float,
     support_angle_rad: float = 0.5 * np.pi,
     poisson_ratio: float = 0.45,
-    sticking: bool = False,
 ) -> SoftBodySpec:
     """Return a horizontal cylinder that is fixed at its back."""
     mesh = MeshSpec(
@@ -33,7 +32,7 @@ def cylinder_spec(
         rotation_rad=0.0,
         slab_depth_m=0.0,
     )
-    return SoftBodySpec(mesh, poisson_ratio, sticking)
+    return SoftBodySpec(mesh, poisson_ratio)
 
 
 class InlineExecutor(Executor):

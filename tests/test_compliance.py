@@ -4,9 +4,7 @@ membrane."""
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,15 +17,12 @@ from flexsheet.launch.calibration.simulated_sheet import simulate_push
 from flexsheet.launch.cli import app, exit_code
 from flexsheet.launch.commands.output import BAD_INPUT
 from flexsheet.launch.health.compliance import (
-    CurveProgress,
-    ForceCurveStage,
     LoopRisk,
     find_loop_risk,
 )
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.running.precompute import report_time_left
 from flexsheet.messages.calibration_file import CalibrationFileError
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, SheetPush
 from flexsheet.nodes.planner.compliance import (
@@ -265,9 +260,7 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
 ) -> None:
     curve = soft_curve(scale)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
-    monkeypatch.setattr(
-        "flexsheet.launch.health.compliance.compute_front_curve", lambda scene, **_: rows
-    )
+    monkeypatch.setattr("flexsheet.launch.health.compliance.compute_front_curve", lambda *_: rows)
     command = ["doctor", "scene", str(SCENE_FILE), "--compliance"]
     result = CliRunner().invoke(app, [*command, "--json"])
     assert result.exit_code == code, result.output
@@ -281,27 +274,6 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     assert "computing the rendered force" in shown.stderr
     assert "rendering error" in shown.stdout
     assert "error of this model relative to the reference" in " ".join(shown.stderr.split())
-
-
-def test_the_doctor_names_its_stages_and_gives_an_estimate_before_the_table(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    curve = soft_curve(0.8)
-    rows = np.column_stack([curve.depths_m, curve.forces_n])
-
-    def compute(scene: Scene, *, on_progress: CurveProgress, on_linear: Any) -> NDArray[np.float64]:
-        on_progress(ForceCurveStage.LINEAR, 1, 1)
-        on_linear(rows)
-        on_progress(ForceCurveStage.TABLE, 0, 4)
-        return rows
-
-    monkeypatch.setattr("flexsheet.launch.health.compliance.compute_front_curve", compute)
-    result = CliRunner().invoke(app, ["doctor", "scene", str(SCENE_FILE), "--compliance"])
-    assert result.exit_code == 0, result.output
-    first, second, third, *_ = result.stderr.splitlines()
-    assert first == f"{ForceCurveStage.LINEAR}: 100 %"
-    assert re.match(r"estimate by the linear model: maximum rendering error [\d.]+ %", second)
-    assert third == f"{ForceCurveStage.TABLE}: 0 %"
 
 
 def test_progress_is_reported_again_when_another_computation_starts() -> None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
-from flexsheet.launch.experiments import ExperimentError, driver
+from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.compliance import (
     DEPTHS_M,
     EVALUATED_S,
@@ -25,18 +23,13 @@ from flexsheet.launch.experiments.compliance import (
     make_presses,
     read_bag,
 )
-from flexsheet.launch.experiments.driver import Driver, TableMethod
 from flexsheet.launch.experiments.force_reference import ReferenceForce, find_reference_curve
 from flexsheet.launch.experiments.stroke import SampledMotion
-from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
-from flexsheet.messages.base import Header, Message
-from flexsheet.messages.notes import Note
-from flexsheet.messages.types import SoftBody, Status
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
 from tests.scenes import make_weightless
-from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
 DEMO = Path(__file__).parent.parent / "launch" / "demo.yaml"
@@ -174,98 +167,3 @@ def test_a_bag_without_a_soft_body_is_rejected(tmp_path: Path) -> None:
         pass
     with pytest.raises(ExperimentError, match="the bag lacks a scene or a force curve"):
         read_bag(bag)
-
-
-class Bench:
-    """Driver without sockets, which receives the messages of a soft-body node from the test."""
-
-    def __init__(self, *settings: str) -> None:
-        self.driver = Driver(load_graph(DEMO, settings=settings), cast(Any, None))
-        self.texts: list[str] = []
-
-    async def wait(self, method: TableMethod = "quick_table") -> None:
-        await self.driver.wait_for_table(SCENE, method, self.texts.append)
-
-    def deliver(self, name: str, message: Message) -> None:
-        self.driver._make_handler(name)(message, Header(1, 0, 0, "virtual", "test", 0))
-
-    def answer(self, method: str, *, in_transition: bool = False) -> None:
-        body = SoftBody(
-            mesh_id="a",
-            method=method,
-            in_range=True,
-            push_depth_m=0.0,
-            force_world_n=np.zeros(3),
-            stiffness_n_per_m=1.0,
-            in_transition=in_transition,
-            displacement_world_m=np.zeros((1, 3), dtype=np.float32),
-        )
-        self.deliver("soft_body", body)
-
-    def report(self, note: str, error: str = "") -> None:
-        status = Status(
-            node="fem_solver",
-            state="running",
-            pid=1,
-            uptime_s=1.0,
-            cpu_ratio=0.0,
-            resident_bytes=1,
-            inputs=(),
-            outputs=(),
-            errors=int(bool(error)),
-            last_error=error,
-            notes=(Note(detail=note),),
-            plan_hash="",
-        )
-        self.deliver("status", status)
-
-
-@pytest.mark.parametrize(
-    ("method", "less_precise", "used"),
-    [
-        ("quick_table", ["linear"], "quick_table"),
-        ("quick_table", ["linear"], "nonlinear_table"),
-        ("nonlinear_table", ["linear", "quick_table"], "nonlinear_table"),
-    ],
-)
-async def test_the_pushes_begin_when_only_a_precise_table_contributes(
-    method: TableMethod, less_precise: list[str], used: str
-) -> None:
-    bench = Bench()
-    waiting = asyncio.create_task(bench.wait(method))
-    await asyncio.sleep(0)
-    bench.report("precomputing the soft body: 40 %, about 30 s left")
-    for name in less_precise:
-        bench.answer(name)
-        await asyncio.sleep(0)
-        assert not waiting.done()
-    bench.answer(used, in_transition=True)
-    await asyncio.sleep(0)
-    assert not waiting.done()
-    bench.answer(used)
-    await asyncio.wait_for(waiting, DEADLINE_S)
-    assert bench.texts == ["precomputing the soft body: 40 %, about 30 s left"]
-
-
-@pytest.mark.parametrize("setting", ["compute_table=false", "method=linear", "friction_ratio=0.3"])
-async def test_an_experiment_does_not_wait_for_a_table_that_is_not_computed(setting: str) -> None:
-    bench = Bench(f"fem_solver.{setting}")
-    bench.answer("linear")
-    await bench.wait()
-
-
-async def test_a_table_that_fails_ends_the_experiment_with_the_reason() -> None:
-    bench = Bench()
-    waiting = asyncio.create_task(bench.wait())
-    await asyncio.sleep(0)
-    bench.report("", "too little memory")
-    with pytest.raises(ExperimentError, match='table: node "fem_solver": too little memory'):
-        await asyncio.wait_for(waiting, DEADLINE_S)
-
-
-async def test_a_table_that_takes_too_long_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver, "MAX_WAIT_S", 0.01)
-    bench = Bench()
-    bench.report("precomputing the soft body: 4 %")
-    with pytest.raises(ExperimentError, match=r"(?s)quick table.*fem_solver: precom"):
-        await bench.wait()

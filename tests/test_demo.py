@@ -141,7 +141,7 @@ def test_an_error_names_the_bag_and_the_command_that_evaluates_it(
         bag.touch()
         raise OverloadedError("timeout")
 
-    monkeypatch.setattr(run, "precompute_graph", lambda plan, progress: None)
+    monkeypatch.setattr(run, "precompute_graph", lambda plan, progress, **_: None)
     monkeypatch.setattr(run, "drive", fail)
     with pytest.raises(OverloadedError) as failed:
         run.run_experiment(run.DEMO_FILE, (), bag, run.chain_procedures(), print)

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexsheet.launch.health.compliance import SKIN_SPACING_M, compute_front_curve
+from flexsheet.launch.health.compliance import compute_front_curve
 from flexsheet.messages.methods import SoftBodyChoice
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.nodes.cache import load_cached, save_cached
-from flexsheet.nodes.fem_solver import precompute, reference, snapshots
+from flexsheet.nodes.fem_solver import precompute, reference, snapshots, soft_body_factory
+from flexsheet.nodes.fem_solver import table as table_module
 from flexsheet.nodes.fem_solver.benchmarks import (
     FORCE,
     MAX_DISPLACEMENT,
@@ -20,14 +21,8 @@ from flexsheet.nodes.fem_solver.benchmarks import (
     SOFT_BODY,
     SoftBodyBenchmark,
 )
-from flexsheet.nodes.fem_solver.body import (
-    SceneBody,
-    attach_table,
-    make_soft_body_spec,
-    make_table_spec,
-)
+from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
 from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
-from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from flexsheet.nodes.fem_solver.table import Table
 from flexsheet.nodes.methods import measure
 from tests.scenes import load_cylinder, load_values
@@ -42,24 +37,34 @@ def small_scene() -> Scene:
     return Scene.model_validate(content)
 
 
+def choose(scene: Scene, choice: SoftBodyChoice) -> Scene:
+    methods = scene.methods.model_copy(update={"soft_body": choice})
+    return scene.model_copy(update={"methods": methods})
+
+
 @pytest.mark.long
 def test_every_method_is_compared_with_a_finer_newton(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.003, 0.005, 0.0075))
+    monkeypatch.setattr(snapshots, "COARSE_DEPTHS_M", (0.0015, 0.003, 0.005, 0.0075))
     monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
     # the reference here is as coarse as the table, whose forces are therefore not corrected
-    monkeypatch.setattr(snapshots, "make_fine_job", lambda *_, **__: None)
+    monkeypatch.setattr(
+        table_module, "compute_force_factors", lambda *given: np.ones(len(given[-1]))
+    )
     # pushes are solved here: other processes would not know of the few sites
-    monkeypatch.setattr(reference, "local_processes", lambda count: nullcontext(InlineExecutor()))
+    for module in (reference, soft_body_factory):
+        monkeypatch.setattr(module, "local_processes", lambda count: nullcontext(InlineExecutor()))
     chart = SoftBodyBenchmark(
         small_scene(),
         tmp_path,
         depths_m=(0.001, 0.003, 0.0075, 0.05),
-        linear_m={"linear": 0.005},
-        table_m={"table": 0.005},
+        choices={
+            "linear": SoftBodyChoice(method="linear", skin_spacing_m=0.005),
+            "table": SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.005),
+        },
         newton_m=(0.003,),
         focused=(0.7,),
         even_m=(0.005,),
@@ -68,11 +73,11 @@ def test_every_method_is_compared_with_a_finer_newton(
     chart.prepare(lambda done, total: reports.append((done, total)))
     assert reports[0][0] == 0
     assert reports[-1][0] == reports[-1][1]
-    monkeypatch.setattr(reference, "local_processes", pytest.fail)  # what was solved is kept
+    monkeypatch.setattr(snapshots, "solve_snapshot", pytest.fail)  # what was solved is kept
     points = {
         (p.method, p.case["depth_mm"]): p for p in (measure(t, repeats=1) for t in chart.trials())
     }
-    assert {method for method, _ in points} >= {"linear", "table", NEWTON}
+    assert {method for method, _ in points} == {"linear", "table", NEWTON}
     linear, table = points["linear", 3.0], points["table", 3.0]
     assert points["linear", 1.0].in_range
     assert points["linear", 1.0].error < 0.2
@@ -87,20 +92,16 @@ def test_every_method_is_compared_with_a_finer_newton(
     assert all(point.extra_metrics[MAX_DISPLACEMENT] < 12.0 for point in deep)
 
 
-def test_the_objects_curve_does_not_depend_on_the_cache(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = small_scene()
-    chosen = SoftBodyChoice(method="linear", skin_spacing_m=SKIN_SPACING_M)
-    chooses_linear = scene.model_copy(
-        update={"methods": scene.methods.model_copy(update={"soft_body": chosen})}
-    )
-    by_linear = compute_front_curve(chooses_linear, tmp_path)
-    spec = make_soft_body_spec(scene, SKIN_SPACING_M)
+def test_the_objects_curve_is_that_of_the_chosen_method(tmp_path: Path) -> None:
+    chosen = SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.0045)
+    scene = choose(small_scene(), chosen)
+    chooses_linear = choose(scene, chosen.model_copy(update={"method": "linear"}))
+    by_linear = compute_front_curve(chooses_linear, tmp_path, lambda text: None)
+    spec = make_soft_body_spec(scene, chosen.skin_spacing_m)
     model = load_cached(precompute.response_cache(spec), tmp_path)
     assert model is not None
     response, depths = model.response, np.linspace(0.0, 0.02, 6)
-    pascals = 1.0 / scene.object.material.young_modulus_pa
+    pascals = 1.0 / require_material(scene).young_modulus_pa
     count = len(response.contact_nodes)
     table = Table(
         depths_m=depths,
@@ -108,17 +109,10 @@ def test_the_objects_curve_does_not_depend_on_the_cache(
         force_n=100.0 * pascals * depths[:, None] * response.normals[:, None],
         reach_m=np.full(count, 0.02),
     )
-
-    def build(_: SoftBodyFactory, scene: Scene, linear: SceneBody, progress: object) -> SceneBody:
-        return attach_table(linear, scene, model, table)
-
-    monkeypatch.setattr(SoftBodyFactory, "build_table", build)
-    when_missing = compute_front_curve(scene, tmp_path)
-    save_cached(make_table_cache(make_table_spec(scene, spec)), tmp_path, table)
-    monkeypatch.delattr(SoftBodyFactory, "build_table")
-    by_table = compute_front_curve(scene, tmp_path)
-    assert np.array_equal(when_missing, by_table)
-    assert np.array_equal(compute_front_curve(chooses_linear, tmp_path), by_linear)
+    save_cached(make_table_cache(make_table_spec(scene, spec, coarse=True)), tmp_path, table)
+    by_table = compute_front_curve(scene, tmp_path, lambda text: None)
+    again = compute_front_curve(chooses_linear, tmp_path, lambda text: None)
+    assert np.array_equal(again, by_linear)
     assert by_table[:, 1] == pytest.approx(100.0 * by_table[:, 0], rel=1e-3, abs=1e-9)
     assert by_linear[-1, 1] != pytest.approx(by_table[-1, 1], rel=0.05)
 

@@ -92,7 +92,7 @@ def test_the_stated_error_decreases_with_depth_and_precision(mesh: MeshSpec) -> 
     stated = np.array(
         [
             [state_force_error_ratio(method, mesh, depth) for depth in depths]
-            for method in ("linear", "quick_table", "nonlinear_table")
+            for method in ("linear", "coarse_table", "nonlinear_table")
         ]
     )
     assert (np.diff(stated, axis=0) <= 0.0).all()

@@ -18,9 +18,9 @@ from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
 from flexsheet.nodes.fem_solver.shipped_pushes import load_shipped, shipped_path
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
 from flexsheet.nodes.fem_solver.snapshots import (
+    COARSE_COUNT,
+    COARSE_DEPTHS_M,
     FINE_RATIO,
-    QUICK_COUNT,
-    QUICK_DEPTHS_M,
     SamplePoint,
     Snapshot,
     choose_sample_points,
@@ -54,7 +54,7 @@ def test_the_first_pushes_cover_the_touchable_skin() -> None:
         away = np.linalg.norm(points[:, None] - np.array(images), axis=2)
         return float(away.min(axis=1).max())
 
-    assert gap(ordered[:QUICK_COUNT]) < 0.7 * gap(samples[:QUICK_COUNT])
+    assert gap(ordered[:COARSE_COUNT]) < 0.7 * gap(samples[:COARSE_COUNT])
 
 
 def test_the_fine_push_has_smaller_elements_at_the_same_point() -> None:
@@ -62,7 +62,6 @@ def test_the_fine_push_has_smaller_elements_at_the_same_point() -> None:
     sample = SamplePoint(0.03 * UP, UP)
     given: dict[str, Any] = {"poisson_ratio": 0.45, "finger_radius_m": FINGER}
     fine = make_fine_job(MESH, sample, **given)
-    assert fine is not None
     usual = make_snapshot_job(MESH, solid, sample, **given)
 
     def spacing(job: Any) -> float:
@@ -123,19 +122,18 @@ def test_the_shipped_pushes_of_the_demo_are_current() -> None:
     """If this test fails, run `python -m benchmarks.ship_tables`."""
     scene = load_scene(LAUNCH / "scenes" / "cylinder.yaml")
     choice = scene.methods.soft_body
-    assert choice is not None
     spec = make_soft_body_spec(scene, choice.skin_spacing_m)
-    path = shipped_path(make_table_cache(make_table_spec(scene, spec)))
+    path = shipped_path(make_table_cache(make_table_spec(scene, spec, coarse=True)))
     shipped = load_shipped(path)
-    assert sorted(shipped) == ["fine", *(f"quick-{number:04d}" for number in range(QUICK_COUNT))]
+    assert sorted(shipped) == ["fine", *(f"push-{number:04d}" for number in range(COARSE_COUNT))]
     assert path.stat().st_size < 1_000_000
     sample = SamplePoint(np.array([0.0, 0.0, 0.0353553]), UP)
     given: dict[str, Any] = {"poisson_ratio": 0.45, "finger_radius_m": FINGER}
     job = make_snapshot_job(
-        spec.mesh, build_mesh(spec.mesh), sample, depths_m=QUICK_DEPTHS_M, **given
+        spec.mesh, build_mesh(spec.mesh), sample, depths_m=COARSE_DEPTHS_M, **given
     )
-    solved, first = solve_snapshot(job), shipped["quick-0000"]
-    assert first.reached == solved.reached == len(QUICK_DEPTHS_M)
+    solved, first = solve_snapshot(job), shipped["push-0000"]
+    assert first.reached == solved.reached == len(COARSE_DEPTHS_M)
     assert first.depths_m == pytest.approx(solved.depths_m)
     assert first.force_n == pytest.approx(solved.force_n, rel=1e-3, abs=1e-9)
     assert first.rest == pytest.approx(solved.rest, abs=1e-7)

@@ -11,6 +11,7 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, ClassVar
@@ -25,7 +26,7 @@ from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import CURVE_FRACTIONS, Response, SkinResponse
 from flexsheet.nodes.fem_solver.mesh import cylinder
 from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
-from flexsheet.nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, compute
 from flexsheet.nodes.fem_solver.precompute_table import (
     TableSpec,
     compute_table,
@@ -309,9 +310,9 @@ def test_a_table_is_kept_whole_or_not_at_all(table: Table, tmp_path: Path) -> No
 def test_an_interrupted_table_resumes(model: SoftBodyModel, table: Table, tmp_path: Path) -> None:
     def stop(done: int, total: int, need: object) -> None:
         if done >= precompute_table.SNAPSHOT_STEPS * 2:
-            raise Interrupted
+            raise InterruptedError
 
-    with pytest.raises(Interrupted):
+    with pytest.raises(InterruptedError):
         compute_table(SPEC, model, tmp_path, CachingExecutor(), stop)
     assert load_cached(make_table_cache(SPEC), tmp_path) is None
     kept = len(list(make_table_cache(SPEC).checkpoints(tmp_path).folder.iterdir()))
@@ -355,28 +356,18 @@ def test_pushes_are_solved_in_other_processes(
     )
     parts = precompute_table.CheckpointStore(tmp_path / "parts")
     with local_processes(1) as executor:
-        (there,) = solve_all([job], executor, parts, lambda count: None)
+        there = solve_all(
+            {"push": partial(solve_snapshot, job)}, executor, parts, lambda count: None
+        )["push"]
     here = solve_snapshot(job)
     assert np.array_equal(there.moved, here.moved)
     assert there.reached == here.reached == 1
 
 
-def test_a_push_that_is_asked_to_stop_does() -> None:
-    mesh = build_mesh(SPEC.body.mesh)
-    sample = snapshots.choose_sample_points(
-        SPEC.body.mesh, mesh, snapshots.find_mirror_planes(mesh), FINGER
-    )[0]
-    job = snapshots.make_snapshot_job(
-        SPEC.body.mesh, mesh, sample, poisson_ratio=0.45, finger_radius_m=FINGER
-    )
-    with pytest.raises(snapshots.SnapshotCancelledError):
-        solve_snapshot(job, lambda: True)
-
-
 def test_an_interrupted_computation_stops_its_workers_at_once() -> None:
-    with suppress(Interrupted), local_processes(1) as executor:
+    with suppress(InterruptedError), local_processes(1) as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
         busy = executor.submit(time.sleep, 60)
         wait_until(busy.running, "the worker to begin")
-        raise Interrupted
+        raise InterruptedError
     assert isinstance(busy.exception(), BrokenProcessPool)

@@ -15,17 +15,16 @@ from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Cylinder
 from flexsheet.nodes.fem_solver import soft_body_factory
-from flexsheet.nodes.fem_solver.body import SceneBody, make_soft_body_spec
+from flexsheet.nodes.fem_solver.body import make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
-from flexsheet.nodes.fem_solver.precompute import Interrupted
 from flexsheet.nodes.fem_solver.snapshots import (
     SamplePoint,
     make_fine_job,
     make_snapshot_job,
     solve_snapshot,
 )
-from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.fem_solver.soft_body_factory import choose_method, load_body, prepare_body
 from flexsheet.nodes.fem_solver.table import compute_force_factors
 from tests.soft_bodies import InlineExecutor
 
@@ -49,7 +48,6 @@ def test_corrected_pushes_of_the_demos_table_are_within_three_percent() -> None:
         forces.append(solved.force_n)
         samples.append(sample)
     fine_job = make_fine_job(spec, samples[0], **given)
-    assert fine_job is not None
     none = np.zeros((len(depths), 1, 3), dtype=np.float32)
     interpolator = SimpleNamespace(interpolate=lambda sample, rest: (none, forces[0], 5.0))
     linear = SimpleNamespace(
@@ -77,20 +75,15 @@ def test_corrected_pushes_of_the_demos_table_are_within_three_percent() -> None:
 def test_the_stated_errors_hold_at_the_references_positions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The quick table uses the shipped pushes of the demo."""
+    """The coarse table uses the shipped pushes of the demo."""
     monkeypatch.setattr(
         soft_body_factory, "local_processes", lambda count: nullcontext(InlineExecutor())
     )
-    scene, bodies = load_scene(SCENE_FILE), []
-    factory = SoftBodyFactory(0.0045, tmp_path)
-    bodies += factory.bodies(scene, "linear", lambda *_: None)
-
-    def stop(quick: SceneBody) -> None:
-        bodies.append(quick)
-        raise Interrupted
-
-    with pytest.raises(Interrupted):
-        factory.build_table(scene, bodies[0], lambda *_: None, stop)
+    scene, choice = load_scene(SCENE_FILE), choose_method(load_scene(SCENE_FILE))
+    bodies = [load_body(scene, choice, tmp_path, lambda *_: None)]
+    prepare_body(scene, choice, tmp_path, lambda *_: None)
+    bodies.append(load_body(scene, choice, tmp_path, lambda *_: None))
+    assert [one.method.name for one in bodies] == ["linear", "coarse_table"]
     geometry = scene.object.geometry
     assert isinstance(geometry, Cylinder)
     for along, around in POSITIONS_M:
@@ -102,12 +95,12 @@ def test_the_stated_errors_hold_at_the_references_positions(
         for depth in (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.004, 0.005, 0.007, 0.010):
             reference = curve.force(depth)
             assert reference is not None
-            linear, quick = (
+            linear, coarse = (
                 float(one.method.respond(ContactQuery(point, normal, depth)).force_n @ normal)
                 for one in bodies
             )
             stated = [one.force_error_ratio(depth) for one in bodies]
             assert linear == pytest.approx(reference.force_n, rel=stated[0]), (along, depth)
-            assert quick == pytest.approx(reference.force_n, rel=stated[1]), (along, depth)
+            assert coarse == pytest.approx(reference.force_n, rel=stated[1]), (along, depth)
             # The linear method is not stated to be much worse than it is, either.
             assert linear > (1.0 + 0.6 * stated[0]) * reference.force_n, (along, depth)

@@ -56,7 +56,7 @@ def on_ports(plan_ports: tuple[int, int]) -> list[str]:
         f"twin_arms.right_port={right}",
         f"arm_left_bridge.port={left}",
         f"arm_right_bridge.port={right}",
-        "fem_solver.compute_table=false",
+        "fem_solver.method=linear",
     ]
 
 

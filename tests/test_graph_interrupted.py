@@ -94,7 +94,7 @@ def test_ctrl_c_at_any_moment_leaves_nothing(runs_folder: Path, words: str) -> N
 )
 def test_an_interrupted_demo_leaves_nothing(runs_folder: Path, number: int, words: str) -> None:
     settings = [part for setting in on_ports(free_ports()) for part in ("--set", setting)]
-    settings += ["--set", "fem_solver.compute_table=false"]
+    settings += ["--set", "fem_solver.method=linear"]
     # Shapes of the sheet are computed before the nodes start, which takes a minute.
     settings += ["--set", "renderer.sheet_shape=four_triangles"]
     demo = start(runs_folder, "demo", "--output", str(runs_folder / "demo"), *settings)

@@ -24,6 +24,7 @@ SPACING_M = 0.005
 def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write a scene of a small cylinder with small pushes on a coarse mesh."""
     monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.002, 0.0025, 0.003))
+    monkeypatch.setattr(snapshots, "COARSE_DEPTHS_M", (0.0015, 0.003))
     monkeypatch.setattr(snapshots, "FINE_DEPTHS_M", (0.0015, 0.003))
     monkeypatch.setattr(snapshots, "FINE_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
@@ -42,6 +43,7 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
     content["object"]["world_from_object"]["position_m"] = [0.0, 0.0, -0.02]
     content["working_range"]["push_depth_m"] = 0.03
+    content["methods"] = {"soft_body": {"method": "nonlinear_table", "skin_spacing_m": SPACING_M}}
     path = tmp_path / "small.yaml"
     YAML().dump(content, path)
     return path
@@ -62,20 +64,23 @@ def flexsheet(
     return run
 
 
+@pytest.mark.parametrize("options", [(), ("--complete-table",)])
 def test_the_table_is_computed_once_in_the_nodes_cache(
     scene_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     flexsheet: Callable[..., tuple[int, str]],
+    options: tuple[str, ...],
 ) -> None:
-    cache = tmp_path / "cache"
-    arguments = ("precompute", scene_file, "--cache", cache, "--skin-spacing", SPACING_M)
+    arguments = ("precompute", scene_file, "--cache", tmp_path / "cache", *options)
     code, printed = flexsheet(*arguments)
     assert code == 0
-    assert ": 0 % (" in printed.split("snapshots for")[0]  # what it will take, before it is begun
-    assert "100 % (" in printed
+    assert "computing the soft body (only once): 0 %" in printed
+    assert "100 %" in printed
     scene = load_scene(scene_file)
-    spec = body.make_table_spec(scene, body.make_soft_body_spec(scene, SPACING_M))
+    spec = body.make_table_spec(
+        scene, body.make_soft_body_spec(scene, SPACING_M), coarse=not options
+    )
     path = precompute_table.make_table_cache(spec).path(tmp_path / "cache")
     assert path.exists()
     assert path.name in printed.replace(" ", "")
@@ -88,11 +93,10 @@ def test_the_table_is_computed_once_in_the_nodes_cache(
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (("--scheduler", "tcp://127.0.0.1:9"), "add --skin-spacing"),
-        (("--skin-spacing", "0.009"), "skin_spacing_m: 0.009 is more than finger.radius_m"),
+        (("--scheduler", "tcp://127.0.0.1:9"), "add --complete-table"),
         (
-            ("--skin-spacing", str(SPACING_M), "--scheduler", "tcp://127.0.0.1:9"),
-            'scheduler "tcp://127.0.0.1:9": no scheduler answers',
+            ("--complete-table", "--scheduler", "tcp://127.0.0.1:9"),
+            'no scheduler answers at "tcp://127.0.0.1:9"',
         ),
     ],
 )

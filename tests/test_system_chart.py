@@ -336,7 +336,8 @@ def test_the_table_of_the_soft_body_is_computed_before_its_configuration_runs(
     for name in ("precompute_deflection_shapes", "precompute_force_table"):
         monkeypatch.setattr(f"{where}.{name}", lambda *_: None)
     monkeypatch.setattr(
-        f"{where}.precompute_soft_body", lambda _, spacing_m, *others: computed.append(spacing_m)
+        f"{where}.precompute_soft_body",
+        lambda _, choice, *others: computed.append(choice.skin_spacing_m),
     )
     (finest,) = [
         one

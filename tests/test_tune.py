@@ -20,9 +20,9 @@ from flexsheet.launch.methods.charts import UnknownFamilyError, find_family
 from flexsheet.launch.methods.results import describe_load
 from flexsheet.launch.methods.tune import choose, evaluate_methods, find_tunables
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.methods import Methods
+from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
+from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
 from flexsheet.nodes.methods import Case, Family, Point
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.force_table import (
@@ -228,21 +228,16 @@ def with_methods(**methods: object) -> Scene:
     return SCENE.model_copy(update={"methods": Methods.model_validate(methods)})
 
 
-def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path: Path) -> None:
-    assert choose_method(SCENE_BARE, "auto", "auto") == ("auto", 0.003)
-    linear = with_methods(soft_body={"method": "linear", "skin_spacing_m": 0.006})
-    assert choose_method(linear, "auto", "auto") == ("linear", 0.006)
-    assert choose_method(linear, "nonlinear_table", 0.0045) == ("nonlinear_table", 0.0045)
-    table = with_methods(soft_body={"method": "nonlinear_table", "skin_spacing_m": 0.0045})
-    assert choose_method(table, "auto", "auto") == ("auto", 0.0045)
-    for by_hand_m, effective in (("auto", "0.0045"), (0.003, "0.003")):
-        method, spacing_m = choose_method(table, "auto", by_hand_m)
-        printed = SoftBodyFactory(spacing_m, tmp_path).pending_note(table, method, [])
-        assert printed.endswith(f"--skin-spacing {effective}")
-        assert f'the scene "{table.name}" as SCENE' in printed
-        dragging = SoftBodyFactory(spacing_m, tmp_path, friction_ratio=0.3)
-        assert dragging.pending_note(table, method, []) == "", "there never is a table"
-    assert SoftBodyFactory(0.006, tmp_path).pending_note(linear, "auto", []) == ""
+def test_the_soft_body_follows_the_scene() -> None:
+    assert choose_method(SCENE_BARE) == SoftBodyChoice(
+        method="nonlinear_table", skin_spacing_m=0.003
+    )
+    linear = SoftBodyChoice(method="linear", skin_spacing_m=0.006)
+    scene = with_methods(soft_body=linear.model_dump())
+    assert choose_method(scene) == linear
+    assert choose_method(scene, "nonlinear_table", 0.0045) == SoftBodyChoice(
+        method="nonlinear_table", skin_spacing_m=0.0045
+    )
 
 
 SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})

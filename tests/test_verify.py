@@ -34,7 +34,7 @@ NODES = ("camera", "triangulator", "planner", "fem_solver")
 def plan_of(folder: Path) -> ResolvedGraph:
     settings = [
         "fem_solver.skin_spacing_m=0.007",
-        "fem_solver.compute_table=false",
+        "fem_solver.method=linear",
         f"fem_solver.cache_dir={folder}/cache",
     ]
     return load_graph(ROOT / "launch" / "demo.yaml", settings=settings, record=folder / "x.mcap")

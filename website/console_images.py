@@ -188,7 +188,7 @@ async def slide(page: Page, label: str, value: float) -> None:
 async def photograph(bag: Path) -> None:
     """Save images of the page of a running graph: tab Touch, a replay, and tab Graph when dark."""
     # The page needs most of the processor time of a computer without a graphics card.
-    settings = [f"console.bags={bag.parent}", "fem_solver.compute_table=false"]
+    settings = [f"console.bags={bag.parent}", "fem_solver.method=linear"]
     plan = load_graph(DEMO, settings=settings, console=True)
     precompute_graph(plan, print)
     url = f"http://127.0.0.1:{plan.nodes['console'].parameters['page_port']}/"

@@ -18,7 +18,7 @@ from flexsheet.launch.commands.graph import (
     run_node_here,
     running_graph,
 )
-from flexsheet.launch.commands.launching import print_omitted
+from flexsheet.launch.commands.launching import precompute_tables, print_omitted
 from flexsheet.launch.commands.output import (
     FAILED,
     NOT_GOOD,
@@ -177,19 +177,21 @@ def play(
             as_json=as_json,
         )
 
-    async def start_and_play(launch_file: Path) -> int:
-        from flexsheet.launch.plans.plan import load_graph
+    async def start_and_play(plan: ResolvedGraph) -> int:
         from flexsheet.launch.running.supervisor import RunningGraph
 
-        plan = load_graph(launch_file)
         print_omitted(plan, None)
         async with RunningGraph(plan) as graph:
-            with words.status(f"starting {launch_file}"):
+            with words.status(f"starting {plan.launch_file}"):
                 await graph.wait_ready()
             return await play_into(plan, graph.run)
 
     if launch is not None:
-        raise typer.Exit(run_interruptible(start_and_play(launch)))
+        from flexsheet.launch.plans.plan import load_graph
+
+        new_plan = load_graph(launch)
+        precompute_tables(new_plan, None)
+        raise typer.Exit(run_interruptible(start_and_play(new_plan)))
     try:
         running = running_graph(choose_run(run))
     except NoGraphError as error:

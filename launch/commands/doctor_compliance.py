@@ -28,14 +28,8 @@ def check_compliance(
 
     Raises typer.Exit with the exit code 1 if a check fails.
     """
-    from flexsheet.launch.health.compliance import (
-        ForceCurveStage,
-        compliance_result,
-        compute_front_curve,
-        describe_estimate,
-    )
+    from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.messages.sheet_calibration import SheetCalibration
     from flexsheet.nodes.planner.compliance import ObjectCurve
     from flexsheet.nodes.planner.force_table import choose_force_model
@@ -45,13 +39,7 @@ def check_compliance(
         scene, None if calibration is None else SheetCalibration.load(calibration)
     )
     with progress_words() as progress:
-        reporters = {stage: report_time_left(stage, progress) for stage in ForceCurveStage}
-        rows = compute_front_curve(
-            scene,
-            on_progress=lambda stage, done, total: reporters[stage](done, total),
-            on_linear=lambda linear: words.print(describe_estimate(scene, law, linear)),
-        )
-        curve = ObjectCurve.from_rows(rows)
+        curve = ObjectCurve.from_rows(compute_front_curve(scene, None, progress))
         progress("computing the rendered force")
         result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms, progress=progress)
     if as_json:

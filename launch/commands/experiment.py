@@ -20,7 +20,6 @@ from flexsheet.launch.commands.output import (
 from flexsheet.messages.units import format_percent
 
 if TYPE_CHECKING:
-    from flexsheet.launch.experiments.driver import TableMethod
     from flexsheet.launch.experiments.image import Series
     from flexsheet.messages.types import FingerPath
 
@@ -167,7 +166,6 @@ def push(
         settings,
         apparatus=apparatus,
         as_json=as_json,
-        with_table=True,
     )
 
 
@@ -182,8 +180,8 @@ def compliance(
         bool,
         typer.Option(
             "--complete-table",
-            help="Wait for the complete table of the soft body. Otherwise, the pushes begin with "
-            "the coarse table if the complete table is not in the cache.",
+            help="Compute the complete table of the soft body first, which takes up to an hour. "
+            "Otherwise, the coarse table is used if the complete table is not in the cache.",
         ),
     ] = False,
     output: options.ResultFolderOption = None,
@@ -191,8 +189,8 @@ def compliance(
 ) -> None:
     """Compare the force on the finger with the force of the virtual object at several push depths.
 
-    The experiment first waits for the precomputed table of the soft body. If the table is not in
-    the cache, its computation takes about a minute.
+    If no table of the soft body is in the cache, the coarse table is computed first, which takes
+    about a minute.
     """
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.run import run_experiment
@@ -200,10 +198,15 @@ def compliance(
     folder = make_result_folder(output, "compliance")
     bag = folder / "compliance.mcap"
     with progress_words() as progress:
-        table: TableMethod = "nonlinear_table" if complete_table else "quick_table"
-        procedure = experiment.make_compliance_procedure(progress, table)
-        given = options.with_scene(settings, scene)
-        run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
+        run_experiment(
+            launch_file,
+            options.with_scene(settings, scene),
+            bag,
+            experiment.make_compliance_procedure(progress),
+            progress,
+            apparatus=apparatus,
+            complete_table=complete_table,
+        )
         result = experiment.compliance_result(bag, progress)
     if as_json:
         print_json(result)
@@ -244,26 +247,14 @@ def _measure_images(
     *,
     apparatus: str | None,
     as_json: bool,
-    with_table: bool = False,
 ) -> None:
-    """Run an image experiment in a graph, record it in a bag, and print the image errors.
-
-    with_table: whether to wait, before the experiment, until the table of the soft body is
-        computed.
-    """
+    """Run an image experiment in a graph, record it in a bag, and print the image errors."""
     from flexsheet.launch.experiments import image
-    from flexsheet.launch.experiments.run import (
-        chain_procedures,
-        make_image_procedure,
-        make_table_procedure,
-        run_experiment,
-    )
+    from flexsheet.launch.experiments.run import make_image_procedure, run_experiment
     from flexsheet.messages.scene import require_cylinder
 
     with progress_words() as progress:
         procedure = make_image_procedure(series, series.values, image.CORRECTIONS, progress)
-        if with_table:
-            procedure = chain_procedures(make_table_procedure(progress), procedure)
         needed = ["twin/eye"]
         run_experiment(
             launch_file,
@@ -379,19 +370,15 @@ def stability(
 
     from flexsheet.launch.experiments import stability as experiment
     from flexsheet.launch.experiments.run import require_scene
-    from flexsheet.launch.health.compliance import ForceCurveStage, compute_front_curve
+    from flexsheet.launch.health.compliance import compute_front_curve
     from flexsheet.launch.plans.plan import load_graph
-    from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
     given = options.with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
-        reporters = {stage: report_time_left(stage, progress) for stage in ForceCurveStage}
-        curve = compute_front_curve(
-            loaded, on_progress=lambda stage, done, total: reporters[stage](done, total)
-        )
+        curve = compute_front_curve(loaded, None, progress)
         result = experiment.stability_result(
             loaded,
             make_force_model(loaded.sheet),

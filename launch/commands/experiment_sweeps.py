@@ -58,7 +58,6 @@ def robustness(
     ] = False,
     seconds: StrokeOption = 10.0,
     workers: options.WorkersOption = 1,
-    scheduler: options.SchedulerOption = None,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
@@ -88,7 +87,6 @@ def robustness(
             calibrated=calibrated,
             seconds=seconds,
             workers=workers,
-            scheduler=scheduler,
             commissioned=commissioned,
         )
     if as_json:
@@ -150,7 +148,6 @@ def sensitivity(
     calibrated: options.CalibratedOption = False,
     seconds: StrokeOption = 10.0,
     workers: options.WorkersOption = 1,
-    scheduler: options.SchedulerOption = None,
     launch_file: options.LaunchOption = options.DEMO,
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
@@ -180,7 +177,6 @@ def sensitivity(
             calibrated=calibrated,
             seconds=seconds,
             workers=workers,
-            scheduler=scheduler,
         )
     if as_json:
         print_json(result)

@@ -22,10 +22,11 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_json_line,
     print_table,
+    progress_words,
     words,
 )
 from flexsheet.nodes import NodeRole, node_class
-from flexsheet.nodes.signals import handle_signals
+from flexsheet.nodes.signals import handle_signals, keyboard_interrupts
 
 if TYPE_CHECKING:
     from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
@@ -130,8 +131,17 @@ def launch(
                 if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
                     webbrowser.open(page_url(node))
 
+    precompute_tables(plan, host)
     work = run_graph(plan, host, duration, without=without or (), when_ready=ready)
     raise typer.Exit(asyncio.run(work))
+
+
+def precompute_tables(plan: ResolvedGraph, host: str | None) -> None:
+    """Compute the tables that the nodes of a host need, and print the progress; None: all hosts."""
+    from flexsheet.launch.running.precompute import precompute_graph
+
+    with keyboard_interrupts(), progress_words() as progress:
+        precompute_graph(plan, progress, host=host)
 
 
 def page_url(console: ResolvedNode) -> str:

@@ -166,7 +166,7 @@ SchedulerOption = Annotated[
     typer.Option(
         "--scheduler",
         metavar="ADDRESS",
-        help="Address of a dask.distributed scheduler that distributes the work, such as "
+        help="Address of a dask.distributed scheduler whose workers compute the table, such as "
         "tcp://host:8786; default: compute on this computer.",
     ),
 ]

@@ -22,7 +22,7 @@ app = make_app()
 @app.command(
     epilog=examples(
         "flexsheet precompute launch/scenes/cylinder.yaml",
-        "flexsheet precompute launch/scenes/cylinder.yaml --skin-spacing 0.005",
+        "flexsheet precompute launch/scenes/cylinder.yaml --complete-table",
     )
 )
 def precompute(
@@ -31,24 +31,23 @@ def precompute(
         Path | None,
         typer.Option(metavar="FOLDER", help="Cache folder; default: the cache of this user."),
     ] = None,
-    skin_spacing_m: Annotated[
-        float | None,
+    complete_table: Annotated[
+        bool,
         typer.Option(
-            "--skin-spacing",
-            metavar="METRES",
-            help="Also compute the nonlinear table of the soft body, with this spacing of surface "
-            "nodes, m; the computation takes minutes.",
+            "--complete-table",
+            help="Also compute the complete nonlinear table of the soft body, which takes up to an "
+            "hour. It is more accurate, and reaches deeper, than the coarse table that is computed "
+            "otherwise.",
         ),
-    ] = None,
+    ] = False,
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the deflection shapes of a scene's sheet if the cache does not contain them.
+    """Compute the tables that a graph with a scene needs, so that its first start is faster.
 
-    The renderer draws a pushed sheet with these shapes. If the object has a material, the table of
-    the sheet's force is also computed, which takes about two minutes. The package contains the
-    table for the sheet of the shipped scenes. Experiments and the demo compute missing shapes
-    automatically.
+    These are the deflection shapes of the sheet, with which the renderer draws a pushed sheet, and
+    the table of the soft body. If the object has a material, the table of the sheet's force is also
+    computed. Without this command, the graph computes all but the force table before it starts.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.running.precompute import (
@@ -57,11 +56,12 @@ def precompute(
         precompute_force_table,
         precompute_soft_body,
     )
+    from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
     from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 
-    if scheduler is not None and skin_spacing_m is None:
+    if scheduler is not None and not complete_table:
         raise typer.BadParameter(
-            "this option distributes the nonlinear table only; add --skin-spacing to select it",
+            "this option distributes the complete table only; add --complete-table",
             param_hint="--scheduler",
         )
     scene = load_scene(scene_file)
@@ -70,10 +70,15 @@ def precompute(
         load_or_compute_bounds(scene.camera.rate_hz, cache, progress)
         if scene.object.material is not None:
             files["force_table"] = precompute_force_table(scene, cache, progress)
-        if skin_spacing_m is not None:
+        if scene.object.material is not None:
             try:
                 files["soft_body"] = precompute_soft_body(
-                    scene, skin_spacing_m, cache, scheduler, progress
+                    scene,
+                    choose_method(scene),
+                    cache,
+                    progress,
+                    complete_table=complete_table,
+                    scheduler=scheduler,
                 )
             except NoSoftBodyError as error:
                 raise CommandError(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from flexsheet.launch.experiments import ExperimentError, find_recorded
-from flexsheet.launch.experiments.driver import Driver, TableMethod
+from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.force_reference import (
     ReferenceForce,
     ReferenceForceCurve,
@@ -165,17 +165,10 @@ def _make_press(
     return Press(path, place, place_m, surface, normal, holds)
 
 
-def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make the coroutine that presses the finger at all positions of the experiment.
-
-    Before the first press, the coroutine waits until the soft-body node uses a sufficiently
-    accurate table of deformations.
-
-    method: soft-body method with the least accurate table that is sufficient.
-    """
+def make_compliance_procedure(progress: Progress) -> Procedure:
+    """Make the coroutine that presses the finger at all positions of the experiment."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
-        await driver.wait_for_table(scene, method, progress)
         for press in make_presses(scene):
             progress(f"pushing along the finger path {press.path.label}")
             await driver.follow(press.path)

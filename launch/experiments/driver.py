@@ -8,10 +8,9 @@ nodes report, and an overload of the computer.
 from __future__ import annotations
 
 import asyncio
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Self
 
 import numpy as np
 
@@ -33,19 +32,11 @@ from flexsheet.messages.types import (
     Shading,
     SheetTarget,
     Skin,
-    SoftBody,
     Status,
     TwinEye,
     TwinFinger,
 )
-from flexsheet.nodes import node_class
-from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
-from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
 from flexsheet.nodes.twin.finger import FingerPathError, check_speed, join_points
-
-TableMethod = Literal["quick_table", "nonlinear_table"]
-TABLE_METHODS: tuple[TableMethod, ...] = get_args(TableMethod)
-"""The methods that use a table, in order of increasing accuracy."""
 
 READ = (
     "twin/finger",
@@ -73,13 +64,10 @@ FRAME_WAIT_S = 20.0
 """The maximum time to wait for the next frame, or for the eye's image after the last frame."""
 
 MAX_WAIT_S = 3600.0
-"""The maximum time to wait for a table of the soft body or an image of the simulated eye, although
-there is progress.
+"""The maximum time to wait for an image of the simulated eye, although there is progress.
 
-Two idle cores need about a minute for the coarse table, about eight minutes for the complete table,
-and a few seconds for an image.
+An idle computer needs a few seconds.
 """
-PROGRESS_PERIOD_S = 5.0
 
 
 @dataclass(slots=True)
@@ -285,58 +273,6 @@ class Driver:
         waited = f"both arms in mode follow{what}"
         await self.wait_for(ready, waited, 3 * WAIT_S, error=ArmsNotReadyError)
 
-    async def wait_for_table(
-        self, scene: Scene, method: TableMethod, progress: Callable[[str], None]
-    ) -> None:
-        """Wait until the soft body uses a table at least as accurate as `method`.
-
-        If the table is not cached, a node uses a less accurate method while it computes the table.
-        Return at once if no node uses a table for the scene.
-
-        progress: function that receives the node's progress and remaining time.
-
-        Raises ExperimentError if the wait takes longer than `MAX_WAIT_S`, or if the table
-        cannot be computed.
-        """
-        solvers = {name: p for name, p in self._solvers() if _computes_table(p, scene)}
-        if not solvers:
-            return
-        accepted = TABLE_METHODS[TABLE_METHODS.index(method) :]
-        failures: list[str] = []
-        reported_s = -PROGRESS_PERIOD_S
-
-        def is_precise() -> bool:
-            body = self._newest.get("soft_body")
-            return isinstance(body, SoftBody) and body.method in accepted and not body.in_transition
-
-        def watch(message: Message) -> None:
-            nonlocal reported_s
-            if not isinstance(message, Status) or message.node not in solvers:
-                return
-            if message.errors:
-                failures.append(f'node "{message.node}": {message.last_error}')
-            if time.monotonic() - reported_s >= PROGRESS_PERIOD_S:
-                progress(message.note_text)
-                reported_s = time.monotonic()
-
-        previous, self.on_message = self.on_message, watch
-        try:
-            await self.wait_for(
-                lambda: is_precise() or bool(failures),
-                f"the soft body by the {method.replace('_', ' ')}; compute the table before the "
-                "experiment (flexsheet precompute SCENE), or choose the linear method in the scene",
-                MAX_WAIT_S,
-            )
-        finally:
-            self.on_message = previous
-        if failures:
-            raise ExperimentError(f"error while waiting for the soft body's table: {failures[0]}")
-
-    def _solvers(self) -> Iterator[tuple[str, FemSolverParameters]]:
-        for name, node in self._plan.nodes.items():
-            if issubclass(node_class(node.type), node_class("fem_solver")):
-                yield name, FemSolverParameters.model_validate(node.parameters)
-
     async def change_scene(self, scene: Scene) -> None:
         """Replace the scene of the graph, and wait until its soft body and both arms are ready."""
         if self._publish_scene is None:
@@ -415,21 +351,6 @@ class Driver:
         await self.wait_for(received, what, FRAME_WAIT_S, progress=Frame)
         # Stop sending pixels in frames until the next image.
         self.show(Display(correction=correction, stereo="side_by_side"))
-
-
-def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
-    """Return whether a solver node requires a precomputed table of deformations for a scene.
-
-    If such a table is missing, the node computes it.
-    """
-    method, _ = choose_method(
-        scene,
-        parameters.method,
-        parameters.skin_spacing_m,
-        compute_table=parameters.compute_table,
-    )
-    has_body = scene.object.material is not None
-    return has_body and method == "nonlinear_table" and parameters.friction_ratio == 0.0
 
 
 def is_settled(arm: ArmState, target: SheetTarget) -> bool:

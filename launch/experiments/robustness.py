@@ -63,7 +63,6 @@ def run_robustness(
     calibrated: bool,
     seconds: float,
     workers: int = 1,
-    scheduler: str | None = None,
     commissioned: bool = False,
 ) -> dict[str, Any]:
     """Evaluate a random laboratory per seed; return the results of `experiment robustness --json`.
@@ -100,7 +99,7 @@ def run_robustness(
             "seconds": seconds,
             "commission_folder": str(folder.resolve() / f"{name}-lab") if commissioned else None,
         }
-    rows = run_sweep(folder, common, trials, progress, workers=workers, scheduler=scheduler)
+    rows = run_sweep(folder, common, trials, progress, workers=workers)
     raise_if_all_failed(rows, folder)
     found = [row for row in rows.values() if "error" not in row]
     failed = [

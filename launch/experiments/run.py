@@ -116,12 +116,14 @@ def run_experiment(
     apparatus: str | None = None,
     needed: Collection[str] = (),
     check_scene: Callable[[Scene], object] = lambda scene: None,
+    complete_table: bool = False,
 ) -> None:
     """Run an experiment's procedure (coroutine) on the graph of a launch file.
 
     bag: file to which all topics are recorded, or None if nothing is recorded.
     check_scene: function that raises an error if the experiment does not support the scene.
     settings, apparatus, needed: arguments for `load_graph`.
+    complete_table: whether the soft body needs its complete table.
     """
     plan = load_graph(
         launch_file,
@@ -131,7 +133,7 @@ def run_experiment(
         needed=needed,
     )
     check_scene(require_scene(plan))
-    precompute_graph(plan, progress)
+    precompute_graph(plan, progress, complete_table=complete_table)
     try:
         asyncio.run(_await_interruptible(drive(plan, procedure, progress)))
     except (ExperimentError, NodeFailedError) as error:
@@ -230,19 +232,6 @@ def make_image_procedure(
             for correction in corrections:
                 label = series.label(value, correction)
                 await driver.capture_image(label, correction, shading)
-
-    return procedure
-
-
-def make_table_procedure(progress: Progress) -> Procedure:
-    """Make a procedure (coroutine) that waits until a table of deformations is used.
-
-    The procedure controls the running graph. The table contains precomputed solutions of the
-    nonlinear deformation of the object. The node of the soft body interpolates them.
-    """
-
-    async def procedure(driver: Driver, scene: Scene) -> None:
-        await driver.wait_for_table(scene, "quick_table", progress)
 
     return procedure
 

@@ -106,7 +106,6 @@ def run_sensitivity(
     calibrated: bool,
     seconds: float,
     workers: int = 1,
-    scheduler: str | None = None,
 ) -> dict[str, Any]:
     """Vary the parameters individually, and return the results of `experiment sensitivity --json`.
 
@@ -136,7 +135,7 @@ def run_sensitivity(
         for parameter, evaluation in evaluations.items()
         if evaluation in (EvaluationKind.OFFLINE, EvaluationKind.SIMULATED_TIME)
     }
-    found = run_sweep(folder, common, trials, progress, workers=workers, scheduler=scheduler)
+    found = run_sweep(folder, common, trials, progress, workers=workers)
     raise_if_all_failed(found, folder)
     effects = {
         row["parameter"]: row["effects"] for row in found.values() if row.get("effects") is not None

@@ -1,9 +1,7 @@
 """Run the trials of a sweep as separate processes, and continue an interrupted sweep.
 
 A trial is a process that prints its result, a row, as JSON. A sweep's folder has `sweep.json` with
-its settings and one JSON file per trial. Trials whose row exists are not run again. Trials run on
-this computer or on the workers of a `dask.distributed` scheduler. The workers must find the launch
-file and the apparatus files (true hardware parameters) under the same paths.
+its settings and one JSON file per trial. Trials whose row exists are not run again.
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.files import write_file
 from flexsheet.nodes.cache import EtaEstimator
-from flexsheet.nodes.fem_solver.precompute_table import stop_requested
 
 Progress = Callable[[str], None]
 Row = dict[str, Any]
@@ -37,6 +35,11 @@ END_S = 20.0
 """The time (s) in which the process of a stopped trial must end the nodes that it started."""
 
 MAX_ERROR_CHARACTERS = 600
+
+_stop_requested: ContextVar[Callable[[], bool]] = ContextVar(
+    "_stop_requested", default=lambda: False
+)
+"""A function that returns whether the trial of this thread must end."""
 
 
 class TrialError(ExperimentError):
@@ -104,7 +107,6 @@ def run_sweep(
     progress: Progress,
     *,
     workers: int = 1,
-    scheduler: str | None = None,
 ) -> dict[str, Row]:
     """Run all trials that have no result row yet, and return the rows of all trials.
 
@@ -112,8 +114,7 @@ def run_sweep(
     the key `error`, and does not stop other trials.
 
     trials: descriptions of the trials for the module `trial`, with trial names as keys.
-    workers: number of simultaneous trials on this computer; ignored if a scheduler is given.
-    scheduler: address of the scheduler that runs the trials.
+    workers: number of simultaneous trials.
     """
     open_sweep(folder, settings)
     done = read_rows(folder, trials)
@@ -129,7 +130,7 @@ def run_sweep(
     if done:
         progress(f"{len(done)} of {len(trials)} trials are finished in {folder}")
     report()
-    with _interruptible(), _executor(workers, scheduler) as executor:
+    with _interruptible(), _executor(workers) as executor:
         waiting: dict[Future[Row], str] = {
             executor.submit(execute_trial, dict(trials[name])): name for name in missing
         }
@@ -159,17 +160,10 @@ def _interruptible() -> Iterator[None]:
 
 
 @contextmanager
-def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
+def _executor(workers: int) -> Iterator[Executor]:
     """Yield an executor for trials; if the context ends with an error, stop the running trials."""
-    if scheduler is not None:
-        # Import only when needed, since importing distributed takes half a second.
-        from flexsheet.nodes.fem_solver.dask_executor import connect_workers
-
-        with connect_workers(scheduler) as executor:
-            yield executor
-        return
     stop = threading.Event()
-    threads = ThreadPoolExecutor(workers, initializer=lambda: stop_requested.set(stop.is_set))
+    threads = ThreadPoolExecutor(workers, initializer=lambda: _stop_requested.set(stop.is_set))
     try:
         yield threads
     except BaseException:
@@ -184,7 +178,7 @@ def execute_trial(trial: Mapping[str, Any]) -> Row:
 
     Raises TrialError if the process fails, or if a stop was requested.
     """
-    must_stop = stop_requested.get()
+    must_stop = _stop_requested.get()
     process = subprocess.Popen(
         [sys.executable, "-m", TRIAL_MODULE],
         stdin=subprocess.PIPE,

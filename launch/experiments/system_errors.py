@@ -38,7 +38,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, SoftBody
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import default_cache_dir
-from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.fem_solver.soft_body_factory import load_body as load_scene_body
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
@@ -259,20 +259,18 @@ class RestingPush:
 @cache
 def _load_curve(scene_json: str, method: SoftBodyMethod, spacing_m: float) -> SoftBody:
     scene = Scene.model_validate_json(scene_json)
-    factory = SoftBodyFactory(skin_spacing_m=spacing_m, cache_dir=default_cache_dir())
-    bodies = factory.bodies(scene, method, lambda *_: None)
-    rest = bodies[0].at_rest()
+    choice = SoftBodyChoice(method=method, skin_spacing_m=spacing_m)
+    rest = load_scene_body(scene, choice, default_cache_dir(), lambda *_: None).at_rest()
     return make_soft_body(rest.force_curve, rest.stiffness_n_per_m)
 
 
-def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
+def load_body(scene: Scene, choice: SoftBodyChoice) -> SoftBody:
     """Return the undeformed soft body of a scene.
 
     choice: method and spacing of the surface nodes. If a required table has not been computed yet,
     the linear method is used instead, as in the solver node.
     """
-    given = choice or SoftBodyChoice(method="linear", skin_spacing_m=0.003)
-    return _load_curve(scene.model_dump_json(), given.method, given.skin_spacing_m)
+    return _load_curve(scene.model_dump_json(), choice.method, choice.skin_spacing_m)
 
 
 def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:

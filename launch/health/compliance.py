@@ -8,20 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flexsheet.launch.running.precompute import Progress, precompute_soft_body
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.units import format_percent
 from flexsheet.nodes import cache
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.fem_solver.soft_body_factory import (
-    SoftBodyFactory,
-    choose_method,
-)
+from flexsheet.nodes.fem_solver.soft_body_factory import choose_method, load_body
 from flexsheet.nodes.models.hand_loop import OffsetBounds, OffsetBoundsTable
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel
 from flexsheet.nodes.planner.compliance import (
@@ -36,58 +32,22 @@ from flexsheet.nodes.planner.compliance import (
 )
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 
-SKIN_SPACING_M = 0.0045
-LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """The push depths that the report lists, as fractions of the maximum push depth."""
 
 
-class ForceCurveStage(StrEnum):
-    """A stage of the computation of an object's force curve, as a text for the user."""
-
-    LINEAR = "computing the linear model of the soft object (only once)"
-    TABLE = "computing the nonlinear table of the soft object from simulated pushes (only once)"
-
-
-CurveProgress = Callable[[ForceCurveStage, int, int], None]
-"""A function that is called with the stage, and the numbers of its finished and of all steps."""
-
-
-def compute_front_curve(
-    scene: Scene,
-    cache_dir: Path | None = None,
-    *,
-    on_progress: CurveProgress = lambda stage, done, total: None,
-    on_linear: Callable[[Floats], None] = lambda curve: None,
-) -> Floats:
+def compute_front_curve(scene: Scene, cache_dir: Path | None, progress: Progress) -> Floats:
     """Return the force of the object as a function of push depth, on the side that faces the user.
 
     The result is an array (n, 2). Each of the n rows contains a depth (m) and a force (N). The
-    linear soft-body method is used only if the scene chooses it. Otherwise, the nonlinear table of
-    the object is used. If this table is not cached, its computation takes minutes.
+    soft-body method of the scene is used. If no table is cached, the coarse table is computed in
+    about a minute.
 
     cache_dir: folder of the cache. If None, the user's cache folder is used.
-    on_linear: function that is called with the force curve of the linear method, (n, 2), before
-        the nonlinear table is computed.
     """
-    factory = SoftBodyFactory(
-        skin_spacing_m=SKIN_SPACING_M,
-        linear_depth_m=LINEAR_DEPTH_M,
-        max_depth_m=MAX_DEPTH_M,
-        friction_ratio=0.0,
-        cache_dir=cache_dir or cache.default_cache_dir(),
-        workers=0,
-    )
-    method, _ = choose_method(scene, "auto", SKIN_SPACING_M, compute_table=True)
-
-    def report(stage: ForceCurveStage, done: int, total: int, need: str) -> None:
-        on_progress(stage, done, total)
-
-    best, *_ = factory.bodies(scene, method, partial(report, ForceCurveStage.LINEAR))
-    if method != "linear" and best.method.name == "linear":
-        on_linear(best.at_rest().force_curve)
-        best = factory.build_table(scene, best, partial(report, ForceCurveStage.TABLE))
-    return best.at_rest().force_curve
+    choice, folder = choose_method(scene), cache_dir or cache.default_cache_dir()
+    precompute_soft_body(scene, choice, folder, progress)
+    return load_body(scene, choice, folder, lambda *_: None).at_rest().force_curve
 
 
 def compute_compliance(
@@ -184,21 +144,6 @@ def find_loop_risk(
     free = compute_compliance(scene, law, curve)
     by_sheet = float(np.abs(free.centre.error_ratio).max()) > TARGET_ERROR_RATIO
     return LoopFinding(LoopRisk.SHEET if by_sheet else LoopRisk.DELAY, delay_s, error_ratio)
-
-
-def describe_estimate(scene: Scene, law: SheetForceModel, curve: Floats) -> str:
-    """Return a text with the rendering error for the linear model of the object, as an estimate.
-
-    law: force model of the sheet.
-    curve: force of the linear model as a function of push depth, rows of depth (m) and force (N).
-    """
-    shown = compute_compliance(scene, law, ObjectCurve.from_rows(curve))
-    error = float(np.abs(shown.centre.error_ratio).max())
-    return (
-        f"estimate by the linear model: maximum rendering error {format_percent(error)} at depths "
-        f"to {1e3 * shown.max_depth_m:.0f} mm, without delay; the nonlinear table, which takes "
-        "minutes, gives the result"
-    )
 
 
 def compliance_result(

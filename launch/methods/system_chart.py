@@ -95,15 +95,12 @@ class Configuration:
 
     def settings(self, graph: ResolvedGraph) -> list[str]:
         """Return the settings "node.parameter=value" that apply this configuration to a graph."""
-        # Tables are not computed in the background, which would disturb the measurement.
-        chosen = [("fem_solver", "compute_table=false")]
-        chosen += [("planner", f"{key}={value}") for key, value in self.planner.items()]
+        chosen = [("planner", f"{key}={value}") for key, value in self.planner.items()]
         for key, (node_type, parameter) in NODE_PARAMETERS.items():
             chosen.append((node_type, f"{parameter}={getattr(self.methods, key)}"))
-        if self.methods.soft_body is not None:
-            body = self.methods.soft_body
-            chosen.append(("fem_solver", f"method={body.method}"))
-            chosen.append(("fem_solver", f"skin_spacing_m={body.skin_spacing_m}"))
+        body = self.methods.soft_body
+        chosen.append(("fem_solver", f"method={body.method}"))
+        chosen.append(("fem_solver", f"skin_spacing_m={body.skin_spacing_m}"))
         return [
             f"{node.name}.{text}"
             for node_type, text in chosen
@@ -114,15 +111,13 @@ class Configuration:
         """Compute and cache the tables that the methods need.
 
         If a table were missing, a node would use another method, and the wrong method would be
-        measured. The computation of the table of a soft body takes minutes.
+        measured. If no table of the soft body is cached, its coarse table is computed.
         """
         if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)
         if scene.object.material is not None:
             precompute_force_table(scene, None, progress)
-        body = self.methods.soft_body
-        if body is not None and body.method == "nonlinear_table" and scene.object.material:
-            precompute_soft_body(scene, body.skin_spacing_m, None, None, progress)
+            precompute_soft_body(scene, self.methods.soft_body, None, progress)
 
     def describe(self) -> dict[str, Any]:
         """Return the methods and the planner's parameters for the description of a trial."""

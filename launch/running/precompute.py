@@ -8,9 +8,13 @@ from pathlib import Path
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.methods import SoftBodyChoice
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole, node_class
-from flexsheet.nodes.cache import default_cache_dir
+from flexsheet.nodes.cache import EtaEstimator, default_cache_dir
+from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
+from flexsheet.nodes.fem_solver.precompute_table import WorkersError
+from flexsheet.nodes.fem_solver.soft_body_factory import choose_method, prepare_body
 from flexsheet.nodes.models.sheet.membrane import NoEquilibriumError
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
 from flexsheet.nodes.renderer import deflection_cache
@@ -28,18 +32,36 @@ class NoSoftBodyError(FlexsheetError, RuntimeError):
     """Raised if the soft body (FEM model) of a scene cannot be computed."""
 
 
-def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
-    """Compute the tables that the graph's planners and renderers need and that are not cached."""
+def precompute_graph(
+    plan: ResolvedGraph,
+    progress: Progress,
+    *,
+    host: str | None = None,
+    complete_table: bool = False,
+) -> None:
+    """Compute the tables that the nodes of a graph need and that are not cached.
+
+    host: host whose nodes are considered. If it is None, the nodes of all hosts are considered.
+    complete_table: whether the soft body needs the complete nonlinear table. Otherwise, the coarse
+        table is sufficient.
+    """
     scene = plan.scene_message()
     if scene is None:
         return
-    for node in plan.nodes.values():
-        if issubclass(node_class(node.type), node_class("planner")):
+    for node in plan.nodes_on(host):
+        kind = node_class(node.type)
+        if issubclass(kind, node_class("planner")):
             load_or_compute_bounds(scene.camera.rate_hz, node.parameters["cache_dir"], progress)
         if node.role is NodeRole.RENDERER:
             shape = node.parameters["sheet_shape"] or scene.methods.sheet_shape
             if shape == "reduced_order":
                 precompute_deflection_shapes(scene, node.parameters["cache_dir"], progress)
+        if issubclass(kind, node_class("fem_solver")) and scene.object.material is not None:
+            given = FemSolverParameters.model_validate(node.parameters)
+            choice = choose_method(scene, given.method, given.skin_spacing_m)
+            precompute_soft_body(
+                scene, choice, given.cache_dir, progress, complete_table=complete_table
+            )
 
 
 def precompute_deflection_shapes(
@@ -73,8 +95,6 @@ def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None
 
     what: name of the computation in the reports.
     """
-    from flexsheet.nodes.cache import EtaEstimator
-
     eta, next_ratio, last, next_s = EtaEstimator(), 0.0, (0, 0), 0.0
 
     def on_progress(done: int, total: int) -> None:
@@ -106,42 +126,35 @@ def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progr
 
 def precompute_soft_body(
     scene: Scene,
-    skin_spacing_m: float,
+    choice: SoftBodyChoice,
     cache_dir: Path | None,
-    scheduler: str | None,
     progress: Progress,
+    *,
+    complete_table: bool = False,
+    scheduler: str | None = None,
 ) -> Path:
-    """Return the file with the nonlinear table of a soft body.
+    """Return the file with the linear response or the nonlinear table of a soft body.
 
-    The table is computed if the file does not exist.
+    The file is computed if it does not exist.
 
-    skin_spacing_m: spacing of the nodes at the surface.
+    choice: method and spacing of the nodes at the surface.
+    complete_table: whether to compute the complete table, which takes up to an hour, instead of the
+        coarse table.
     scheduler: address of a dask.distributed scheduler. If it is None, the table is computed on this
         computer.
 
     Raises NoSoftBodyError if the scheduler cannot be used, the body cannot be meshed, or memory is
     insufficient.
     """
-    from flexsheet.nodes.cache import EtaEstimator
-    from flexsheet.nodes.fem_solver import body, precompute_table
-    from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
-
-    folder = cache_dir or default_cache_dir()
-    eta, reported_percent = EtaEstimator(), -1
-
-    def on_progress(done: int, total: int, need: str) -> None:
-        nonlocal reported_percent
-        progress_text = eta.text(done, total, time.monotonic())
-        if 100 * done // total != reported_percent:
-            progress(f"computing the soft body: {progress_text} ({need})")
-            reported_percent = 100 * done // total
-
-    factory = SoftBodyFactory(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
+    report = report_time_left("computing the soft body (only once)", progress)
     try:
-        bodies = factory.bodies(scene, "auto", on_progress)
-        if len(bodies) == 1:
-            factory.build_table(scene, bodies[0], on_progress)
-    except (ValueError, MemoryError, precompute_table.WorkersError) as error:
+        return prepare_body(
+            scene,
+            choice,
+            cache_dir or default_cache_dir(),
+            lambda done, total, need: report(done, total),
+            complete_table=complete_table,
+            scheduler=scheduler,
+        )
+    except (ValueError, MemoryError, WorkersError) as error:
         raise NoSoftBodyError(str(error)) from error
-    spec = body.make_table_spec(scene, bodies[0].spec)
-    return precompute_table.make_table_cache(spec).path(folder)

@@ -16,31 +16,34 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import structlog
 
+from flexsheet.messages.methods import SoftBodyChoice
 from flexsheet.messages.scene import Cylinder, Scene, require_material
 from flexsheet.nodes.arrays import Floats, Singles
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import snapshots
-from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from flexsheet.nodes.fem_solver.body import SceneBody
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.newton import EquilibriumState, NeoHookeanBody
-from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, load_or_compute
 from flexsheet.nodes.fem_solver.reference import (
-    LocalTable,
     ReferenceSolution,
-    load_full_table,
     make_even_job,
     make_focused_job,
     solve_cached_jobs,
 )
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob
+from flexsheet.nodes.fem_solver.soft_body_factory import load_body, prepare_body
 from flexsheet.nodes.methods import Family, Progress, Trial, clip_range
 
-LINEAR_SPACINGS_M = {"linear, coarse": 0.006, "linear, medium": 0.0045, "linear, fine": 0.003}
-TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
+LINEAR = {
+    f"linear, {name}": SoftBodyChoice(method="linear", skin_spacing_m=spacing_m)
+    for name, spacing_m in (("coarse", 0.006), ("medium", 0.0045), ("fine", 0.003))
+}
+TABLES = {
+    "nonlinear table, medium": SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.0045)
+}
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
@@ -55,7 +58,6 @@ SAMPLE_OFFSET_M = np.array([0.004, 0.003, 0.0])
 """The offset (m) of the pushed point from the surface point nearest to the user. With this offset,
 the pushed point is not a node of any mesh. A push at a node would favour the methods that use this
 mesh."""
-LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 RIM_RATIO = 1.5
 """The distance from the push, in finger radii, within which displacement errors are ignored,
 because the finger hides the skin."""
@@ -81,8 +83,8 @@ class SoftBodyBenchmark:
     """A benchmark of the soft-body methods for pushes at one surface point of a scene's object.
 
     depths_m: push depths.
-    linear_m, table_m: distances between skin nodes (m) of the linear methods and of the nonlinear
-        tables. The keys are the names of the methods.
+    choices: methods with the distances between skin nodes, by the names in the chart. A table that
+        is not cached is replaced by the coarse table.
     newton_m: depths at which the time of full Newton solutions is measured.
     focused: distances between skin nodes of the reference meshes that are fine only near the
         finger, in finger radii.
@@ -92,38 +94,18 @@ class SoftBodyBenchmark:
     scene: Scene
     cache_dir: Path
     depths_m: Sequence[float]
-    linear_m: Mapping[str, float]
-    table_m: Mapping[str, float]
+    choices: Mapping[str, SoftBodyChoice]
     newton_m: Sequence[float]
     focused: Sequence[float]
     even_m: Sequence[float]
 
-    def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Return the soft body with the linear method, and its precomputed linear response.
-
-        The response is loaded from the cache if possible. spacing_m: distance between skin nodes.
-        """
-        spec = make_soft_body_spec(self.scene, spacing_m)
-
-        def log_start(done: int, total: int, need: str) -> None:
-            if done == 0:
-                structlog.get_logger().info(
-                    "precomputing: soft body", spacing_m=spacing_m, need=need
-                )
-
-        model = load_or_compute(spec, self.cache_dir, log_start)
-        body = build_scene_body(
-            self.scene,
-            spec,
-            model,
-            linear_depth_m=LINEAR_DEPTH_M,
-            max_depth_m=MAX_DEPTH_M,
-        )
-        return body, model
+    def body(self, choice: SoftBodyChoice) -> SceneBody:
+        """Return the soft body with a method, from the cache."""
+        return load_body(self.scene, choice, self.cache_dir, lambda *_: None)
 
     def coarsest(self) -> SceneBody:
-        """Return the soft body with the coarsest skin mesh, for the linear method."""
-        return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
+        """Return the soft body with the coarsest skin mesh."""
+        return self.body(max(self.choices.values(), key=lambda choice: choice.skin_spacing_m))
 
     def sample(self) -> SamplePoint:
         """Return the surface point that is pushed in all trials."""
@@ -148,25 +130,16 @@ class SoftBodyBenchmark:
                 jobs.append((f"{1e3 * even:g} mm everywhere", job))
         return jobs
 
-    def local_tables(self) -> dict[str, LocalTable]:
-        """Return nonlinear tables that cover only the skin near the push.
-
-        The keys of the result are the names of the methods. Methods whose full table is cached are
-        omitted.
-        """
-        found = {}
-        for name, spacing in self.table_m.items():
-            body, model = self.linear(spacing)
-            if load_full_table(body, self.scene, model, self.cache_dir) is None:
-                found[name] = LocalTable(body, self.scene, model, self.sample())
-        return found
-
     def prepare(self, on_progress: Progress) -> None:
-        """Compute and cache all reference solutions and table snapshots, which takes minutes."""
-        jobs = [job for _, job in self.reference_jobs()]
-        for table in self.local_tables().values():
-            jobs += table.jobs
-        solve_cached_jobs(jobs, self.cache_dir, on_progress)
+        """Compute and cache the soft bodies and all reference solutions."""
+        for choice in self.choices.values():
+            prepare_body(
+                self.scene,
+                choice,
+                self.cache_dir,
+                lambda done, total, need: on_progress(done, total),
+            )
+        solve_cached_jobs([job for _, job in self.reference_jobs()], self.cache_dir, on_progress)
 
     def reference_set(self) -> ReferenceSet:
         """Load the reference solutions from the cache, or compute them."""
@@ -185,18 +158,8 @@ class SoftBodyBenchmark:
         does not hide, in mm. The force error is an additional metric.
         """
         sample, references = self.sample(), self.reference_set()
-        bodies = {name: self.linear(spacing)[0] for name, spacing in self.linear_m.items()}
-        local = self.local_tables()
-        for name, spacing in self.table_m.items():
-            body, model = self.linear(spacing)
-            with_table = load_full_table(body, self.scene, model, self.cache_dir)
-            if with_table is None:
-                table = local[name]
-                with_table = table.body(
-                    solve_cached_jobs(table.jobs, self.cache_dir, _ignore_progress)
-                )
-            bodies[name] = with_table
-        for name, body in bodies.items():
+        for name, choice in self.choices.items():
+            body = self.body(choice)
             for depth in self.depths_m:
                 query = ContactQuery(sample.point, sample.normal, depth)
                 run = partial(body.method.respond, query)
@@ -325,8 +288,7 @@ def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
         scene,
         default_cache_dir(),
         depths_m=clip_range(max_depth_m, DEPTHS_M),
-        linear_m=LINEAR_SPACINGS_M,
-        table_m=TABLE_SPACINGS_M,
+        choices=LINEAR | TABLES,
         newton_m=[depth for depth in NEWTON_DEPTHS_M if depth <= max_depth_m],
         focused=FOCUSED_RATIOS,
         even_m=EVEN_SPACINGS_M,
@@ -358,8 +320,8 @@ def _family(methods: Sequence[str], **changes: Any) -> Family:
     )
 
 
-SOFT_BODY = _family([*LINEAR_SPACINGS_M, *TABLE_SPACINGS_M, NEWTON])
-SOFT_BODY_LINEAR = _family([*LINEAR_SPACINGS_M], table_m={}, newton_m=())
-SOFT_BODY_TABLES = _family([*TABLE_SPACINGS_M], linear_m={}, newton_m=())
+SOFT_BODY = _family([*LINEAR, *TABLES, NEWTON])
+SOFT_BODY_LINEAR = _family([*LINEAR], choices=LINEAR, newton_m=())
+SOFT_BODY_TABLES = _family([*TABLES], choices=TABLES, newton_m=())
 """The benchmarks of all methods (`SOFT_BODY`), of the linear methods only (`SOFT_BODY_LINEAR`), and
-of the nonlinear tables only (`SOFT_BODY_TABLES`). Precomputing the tables takes minutes."""
+of the nonlinear tables only (`SOFT_BODY_TABLES`)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,12 +10,7 @@ import numpy as np
 from flexsheet.messages.scene import Scene, require_material
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.fem_solver.closest_contact import (
-    ContactAnchor,
-    locate,
-    locate_sticking,
-    slide_anchor,
-)
+from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, locate
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
 from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec, mesh_spec, world_from_mesh
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
@@ -27,14 +21,19 @@ from flexsheet.nodes.models import rigid
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.shapes import Shape, make_shape
 
-QUICK_TABLE = "quick_table"
-"""The name of the method that uses the coarse nonlinear table. This table is computed first, from
-only a few snapshots (precomputed pushes)."""
+COARSE_TABLE = "coarse_table"
+"""The name of the method that uses the coarse nonlinear table. This table is computed from only a
+few snapshots (precomputed pushes)."""
+LINEAR_DEPTH_M = 0.006
+"""The push depth up to which the linear method is valid. The stiffness is evaluated at this depth.
+"""
+MAX_DEPTH_M = 0.010
+"""The push depth at which the displacement of the linear method stops growing."""
 ERROR_DEPTHS_M = (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.005)
 _LINEAR_ERRORS = (1.13, 0.76, 0.59, 0.46, 0.32, 0.26)
 FORCE_ERROR_RATIOS = {
     "linear": (_LINEAR_ERRORS, _LINEAR_ERRORS),
-    QUICK_TABLE: ((0.18, 0.10, 0.10, 0.10, 0.10, 0.10), (1.13, 0.76, 0.59, 0.46, 0.22, 0.22)),
+    COARSE_TABLE: ((0.18, 0.10, 0.10, 0.10, 0.10, 0.10), (1.13, 0.76, 0.59, 0.46, 0.22, 0.22)),
     "nonlinear_table": ((0.17, 0.07, 0.03, 0.03, 0.03, 0.03), (1.13, 0.76, 0.15, 0.15, 0.15, 0.15)),
 }
 """The estimated relative errors of each method's contact force at the depths `ERROR_DEPTHS_M`.
@@ -63,14 +62,11 @@ def state_force_error_ratio(method: str, mesh: MeshSpec, depth_m: float) -> floa
     return float(np.interp(depth_m, ERROR_DEPTHS_M, errors))
 
 
-def make_soft_body_spec(
-    scene: Scene, skin_spacing_m: float, *, sticking: bool = False
-) -> SoftBodySpec:
+def make_soft_body_spec(scene: Scene, skin_spacing_m: float) -> SoftBodySpec:
     """Return the inputs of the precomputation for the object of a scene.
 
-    skin_spacing_m: distance between skin nodes. sticking: whether the finger sticks to the skin.
-    Raises ValueError if the skin spacing exceeds the radius of the fingertip, or if the axis of a
-    cylinder points to the user.
+    skin_spacing_m: distance between skin nodes. Raises ValueError if the skin spacing exceeds the
+    radius of the fingertip, or if the axis of a cylinder points to the user.
     """
     if skin_spacing_m > scene.finger.radius_m:
         raise ValueError(
@@ -78,13 +74,12 @@ def make_soft_body_spec(
             f"({scene.finger.radius_m:g}), and the force would be far too large; reduce "
             "skin_spacing_m to the radius or less"
         )
-    mesh = mesh_spec(scene, skin_spacing_m)
-    return SoftBodySpec(mesh, require_material(scene).poisson_ratio, sticking)
+    return SoftBodySpec(mesh_spec(scene, skin_spacing_m), require_material(scene).poisson_ratio)
 
 
-def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
+def make_table_spec(scene: Scene, spec: SoftBodySpec, *, coarse: bool = False) -> TableSpec:
     """Return the inputs from which a soft body's table of nonlinear push responses is computed."""
-    return TableSpec(spec, scene.finger.radius_m)
+    return TableSpec(spec, scene.finger.radius_m, coarse)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +89,7 @@ class SceneBody:
     method: method that computes the response. shape: surface of the body. spec: inputs of the
     precomputation. skin: skin mesh. front (3,): surface point nearest to the user, m, mesh frame
     (see `find_front`). world_from_mesh (4, 4): pose of the mesh frame in the world. rest (s, 3):
-    undeformed positions of the s skin nodes, m, mesh frame. linear_depth_m: maximum depth of the
-    linear method, at which the stiffness is evaluated. friction_ratio: friction coefficient; 0
-    means that the finger slides freely.
+    undeformed positions of the s skin nodes, m, mesh frame.
     """
 
     method: SoftBodyMethod
@@ -106,8 +99,6 @@ class SceneBody:
     world_from_mesh: Floats
     rest: Floats
     skin: Skin
-    linear_depth_m: float
-    friction_ratio: float
 
     def respond(
         self, point_world: Floats, anchor: ContactAnchor | None
@@ -118,23 +109,8 @@ class SceneBody:
         the first call. Raises ValueError if a coordinate of the point is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
-        if self.friction_ratio == 0.0:
-            query, new_anchor = locate(self.shape, point, anchor)
-            return self.method.respond(query), new_anchor
-        query, new_anchor = locate_sticking(self.shape, point, anchor)
-        response = self.method.respond(query)
-        if new_anchor is None or query.drag_m is None:
-            return response, new_anchor
-        normal_n = float(response.force_n @ query.normal)
-        tangential_n = float(np.linalg.norm(response.force_n - normal_n * query.normal))
-        limit_n = self.friction_ratio * max(normal_n, 0.0)
-        if tangential_n > limit_n:
-            # The tangential force is proportional to the displacement of the finger since it stuck:
-            # reduce both so that the force equals the friction limit.
-            fraction = limit_n / tangential_n
-            new_anchor = slide_anchor(self.shape, new_anchor, query.drag_m, fraction)
-            response = self.method.respond(replace(query, drag_m=fraction * query.drag_m))
-        return response, new_anchor
+        query, new_anchor = locate(self.shape, point, anchor)
+        return self.method.respond(query), new_anchor
 
     def at_rest(self) -> Response:
         """Return the response of the body while the finger does not touch it.
@@ -155,20 +131,11 @@ class SceneBody:
         """Return the estimated relative error of the contact force at a push depth."""
         return state_force_error_ratio(self.method.name, self.spec.mesh, depth_m)
 
-    def message(
-        self,
-        response: Response,
-        *,
-        horizon_s: float = 0.0,
-        replaced: Sequence[SceneBody] = (),
-    ) -> SoftBody:
+    def message(self, response: Response, *, horizon_s: float = 0.0) -> SoftBody:
         """Return the message with a response of this soft body, with vectors in the world frame.
 
         horizon_s: time from the camera exposure to the predicted fingertip position.
-        replaced: previous soft bodies, for example of a less accurate method. During a transition,
-            they still contribute to the response.
         """
-        errors = [one.force_error_ratio(response.push_depth_m) for one in (self, *replaced)]
         rotation = self.world_from_mesh[:3, :3]
         rotated = response.displacement @ rotation.T.astype(np.float32)
         return SoftBody(
@@ -180,8 +147,7 @@ class SceneBody:
             stiffness_n_per_m=response.stiffness_n_per_m,
             force_curve=response.force_curve,
             prediction_horizon_s=horizon_s,
-            force_error_ratio=max(errors),
-            in_transition=bool(replaced),
+            force_error_ratio=self.force_error_ratio(response.push_depth_m),
             displacement_world_m=np.ascontiguousarray(rotated),
         )
 
@@ -207,21 +173,10 @@ def find_front(shape: Shape, rest: Floats, towards_user: Floats) -> Floats:
     return shape.closest(point).point
 
 
-def build_scene_body(
-    scene: Scene,
-    spec: SoftBodySpec,
-    model: SoftBodyModel,
-    *,
-    linear_depth_m: float,
-    max_depth_m: float,
-    friction_ratio: float = 0.0,
-) -> SceneBody:
-    """Build the soft body of a scene from its precomputed model.
+def build_scene_body(scene: Scene, spec: SoftBodySpec, model: SoftBodyModel) -> SceneBody:
+    """Build the soft body of a scene from its precomputed model, with the linear method.
 
-    linear_depth_m: maximum depth at which the linear method is valid. max_depth_m: push depth at
-    which the displacement stops growing. friction_ratio: friction coefficient between finger and
-    skin. Raises ValueError unless 0 < linear_depth_m < max_depth_m, or if the axis of a cylinder
-    points to the user.
+    Raises ValueError if the axis of a cylinder points to the user.
     """
     pose = world_from_mesh(scene)
     shape = make_shape(dict(scene.object.geometry))
@@ -232,10 +187,9 @@ def build_scene_body(
         rest[model.bounds],
         young_modulus_pa=require_material(scene).young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
-        linear_depth_m=linear_depth_m,
-        max_depth_m=max_depth_m,
+        linear_depth_m=LINEAR_DEPTH_M,
+        max_depth_m=MAX_DEPTH_M,
         push_depth_m=scene.working_range.push_depth_m,
-        drag=model.drag,
     )
     pose_digest = hashlib.sha256(pose.tobytes()).hexdigest()[:8]
     skin = Skin(
@@ -251,49 +205,27 @@ def build_scene_body(
         world_from_mesh=pose,
         rest=rest,
         skin=skin,
-        linear_depth_m=linear_depth_m,
-        friction_ratio=friction_ratio,
     )
 
 
 def attach_table(
-    body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table, *, quick: bool = False
+    body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table, *, coarse: bool = False
 ) -> SceneBody:
     """Return a copy of the body that computes its responses from a precomputed nonlinear table.
 
-    quick: whether the table is the coarse table, which is computed first from only a few pushes.
+    coarse: whether the table is a coarse table, which is computed from only a few pushes.
     """
     method = TableSoftBody(
         model.response,
         model.response.rest[model.bounds],
         table,
-        name=QUICK_TABLE if quick else "nonlinear_table",
+        name=COARSE_TABLE if coarse else "nonlinear_table",
         young_modulus_pa=require_material(scene).young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         push_depth_m=scene.working_range.push_depth_m,
-        linear_depth_m=body.linear_depth_m,
+        linear_depth_m=LINEAR_DEPTH_M,
     )
     return replace(body, method=method)
-
-
-def blend_responses(old: Response, new: Response, weight: float) -> Response:
-    """Return the weighted mean of two responses.
-
-    weight: weight of the new response, from 0 to 1. Fields that cannot be averaged, and the depths
-    of the force curve, are taken from the new response.
-    """
-    depths = new.force_curve[:, 0]
-    before = np.interp(depths, old.force_curve[:, 0], old.force_curve[:, 1])
-    curve = np.column_stack([depths, before + weight * (new.force_curve[:, 1] - before)])
-    part = np.float32(weight)
-    return replace(
-        new,
-        displacement=old.displacement + part * (new.displacement - old.displacement),
-        force_n=old.force_n + weight * (new.force_n - old.force_n),
-        stiffness_n_per_m=old.stiffness_n_per_m
-        + weight * (new.stiffness_n_per_m - old.stiffness_n_per_m),
-        force_curve=curve,
-    )
 
 
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:

@@ -25,16 +25,13 @@ class ContactQuery:
 
     surface (3,), normal (3,): pushed surface point, m, and its outward normal. depth_m: depth of
     the fingertip below this point along the normal; negative if the fingertip is outside the
-    object. beyond_m: distance of the fingertip beyond the edge of the surface. drag_m (3,):
-    displacement of the fingertip along the surface since it started to stick to the point; None if
-    the finger slides.
+    object. beyond_m: distance of the fingertip beyond the edge of the surface.
     """
 
     surface: Floats
     normal: Floats
     depth_m: float
     beyond_m: float = 0.0
-    drag_m: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,38 +67,6 @@ def locate(
             return _make_query(point, anchor.point, anchor.normal, False), anchor
     query = _make_query(point, found.point, found.normal, bool(found.on_edge))
     return query, ContactAnchor(found.point, found.normal)
-
-
-def locate_sticking(
-    shape: Shape, point: Floats, anchor: ContactAnchor | None
-) -> tuple[ContactQuery, ContactAnchor | None]:
-    """Return the contact of a sticking fingertip at `point` (3,), m, and the next anchor.
-
-    anchor: first contact point, to which the fingertip sticks, or None if there is no contact yet.
-    Pass the returned anchor to the next call. Raises ValueError if a coordinate of the point is not
-    finite.
-    """
-    query, new_anchor = locate(shape, point, anchor)
-    if new_anchor is None or anchor is None:
-        return query, new_anchor
-    depth = float((anchor.point - point) @ anchor.normal)
-    if depth <= 0.0:
-        # The finger has left its anchor and touches another point.
-        return query, new_anchor
-    drag = point - anchor.point + depth * anchor.normal
-    return ContactQuery(anchor.point, anchor.normal, depth, query.beyond_m, drag), anchor
-
-
-def slide_anchor(
-    shape: Shape, anchor: ContactAnchor, drag: Floats, fraction: float
-) -> ContactAnchor:
-    """Return the anchor (pushed surface point) after the finger has slid over the surface.
-
-    drag (3,): displacement of the finger from the anchor, m. fraction: fraction of this
-    displacement that remains after the slide.
-    """
-    found = shape.closest(anchor.point + (1.0 - fraction) * drag, previous=anchor.point)
-    return ContactAnchor(found.point, found.normal)
 
 
 def _make_query(

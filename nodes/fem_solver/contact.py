@@ -37,9 +37,6 @@ FACING = (0.2, 0.6)
 the angle between skin normal and contact normal."""
 PAD_RATIO = 1.1
 """The half width of the contact patch at the end of the linear range, in finger radii."""
-TANGENTIAL_COMPLIANCE_RATIO = 0.004
-"""The tangential compliance of a sticking contact point. It is the displacement, in finger radii,
-at which the tangential force equals the normal force."""
 FULL_STEPS = 8
 MAX_ITERATIONS = 40
 CURVE_FRACTIONS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
@@ -62,21 +59,6 @@ class SkinResponse:
     contact_nodes: Ints
     normals: Floats
     faces: Ints
-    compliance: Floats
-    influence: Singles
-
-
-@dataclass(frozen=True, slots=True)
-class DragResponse:
-    """The response of a linear body to unit tangential forces on its skin.
-
-    Young's modulus is 1 Pa. The body has m contact nodes, which the finger can touch, and s skin
-    nodes. tangents (m, 2, 3): two directions along the skin at each contact node. compliance
-    (2m, 2m): displacement along direction i (m) per force along direction j (N). influence
-    (2m, 3s), float32: displacement (m) of all skin nodes per force (N) along each direction.
-    """
-
-    tangents: Floats
     compliance: Floats
     influence: Singles
 
@@ -137,17 +119,12 @@ class NormalContact:
     """The solution of a frictionless contact between skin and finger.
 
     nodes (k,): indices of the k loaded contact nodes. forces (k,): inward forces on these nodes, N.
-    force_n (3,): total force on the finger. The other fields describe the q contact points with a
-    pressure above zero. weights (q, k): shape functions of the nodes. normals (q, 3): skin normals.
-    pressed_n (q,): normal forces.
+    force_n (3,): total force on the finger.
     """
 
     nodes: Ints
     forces: Floats
     force_n: Floats
-    weights: Floats
-    normals: Floats
-    pressed_n: Floats
 
 
 def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
@@ -277,55 +254,7 @@ class SphereContact:
         weights[np.arange(len(reached))[:, None], local.reshape(-1, 6)] = self._shape[point]
         compliance, penalty = self._compliance[np.ix_(nodes, nodes)], self._penalty[face]
         forces = solve_penalty_contact(weights, compliance, penalty, depths[reached])
-        remaining = depths[reached] - weights @ (compliance @ forces)
-        pressed = remaining > 0.0
-        return NormalContact(
-            nodes=nodes,
-            forces=forces,
-            force_n=forces @ self._response.normals[nodes],
-            weights=weights[pressed],
-            normals=self._normals[face[pressed], point[pressed]],
-            pressed_n=penalty[pressed] * remaining[pressed],
-        )
-
-
-class DragContact:
-    """A solver of the tangential contact of a finger that sticks to the skin.
-
-    Tangential springs connect the contact points to the finger. The stiffness of a spring is
-    proportional to the normal force at its point. Therefore the tangential forces are zero when
-    contact begins and ends. They do not affect the normal forces.
-    """
-
-    def __init__(
-        self, response: DragResponse, *, young_modulus_pa: float, finger_radius_m: float
-    ) -> None:
-        self.influence, self._tangents = response.influence, response.tangents
-        self._compliance = response.compliance / young_modulus_pa
-        self._full_load_slip_m = TANGENTIAL_COMPLIANCE_RATIO * finger_radius_m
-
-    def solve(self, contact: NormalContact, drag: Floats) -> tuple[Ints, Floats, Floats]:
-        """Return the tangential forces of a sticking finger for a given normal contact.
-
-        drag (3,): displacement of the finger since it started to stick, m.
-
-        Returns three arrays: row indices (2k,), forces (2k,), N, and the total force (3,), N. The
-        indices select rows of the attribute `influence`, two for each of the k loaded nodes.
-        """
-        nodes, count = contact.nodes, len(contact.nodes)
-        rows = (2 * nodes[:, None] + np.arange(2)).ravel()
-        across = self._tangents[nodes]
-        along = np.eye(3) - contact.normals[:, :, None] * contact.normals[:, None, :]
-        # Tangential displacement of the contact points (3 q) per displacement of the nodes along
-        # their two tangents (2 k).
-        moved = np.einsum("qk,kai,qij->qjka", contact.weights, across, along, optimize=True)
-        moved = moved.reshape(-1, 2 * count)
-        springs = np.repeat(contact.pressed_n / self._full_load_slip_m, 3)
-        target_drag = (along @ drag).ravel()
-        loads = moved.T * springs
-        system = np.eye(2 * count) + loads @ moved @ self._compliance[np.ix_(rows, rows)]
-        forces = np.linalg.solve(system, loads @ target_drag)
-        return rows, forces, -np.einsum("ka,kai->i", forces.reshape(-1, 2), across)
+        return NormalContact(nodes, forces, forces @ self._response.normals[nodes])
 
 
 def solve_penalty_contact(
@@ -405,7 +334,6 @@ class LinearSoftBody:
         linear_depth_m: float,
         max_depth_m: float,
         push_depth_m: float | None = None,
-        drag: DragResponse | None = None,
     ) -> None:
         """Precompute the force curves of all touchable mesh corners.
 
@@ -414,7 +342,6 @@ class LinearSoftBody:
         linear_depth_m: depth above which pushes are reported as out of range.
         max_depth_m: depth above which the displacement does not increase.
         push_depth_m: depth at which the force curve ends; None means `max_depth_m`.
-        drag: tangential response for a sticking finger, or None if there is no friction.
 
         Raises ValueError unless 0 < linear_depth_m < max_depth_m.
         """
@@ -426,11 +353,6 @@ class LinearSoftBody:
         self.contact = SphereContact(
             response, shape, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
         )
-        self._drag: DragContact | None = None
-        if drag is not None:
-            self._drag = DragContact(
-                drag, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
-            )
         self._response = response
         self._modulus = young_modulus_pa
         self._linear, self._largest = linear_depth_m, max_depth_m
@@ -458,15 +380,10 @@ class LinearSoftBody:
         if contact is None:
             clear = query.depth_m <= 0.0 or query.beyond_m > 0.0
             return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, clear)
-        total = self._sum(self._response.influence, contact.nodes, contact.forces)
-        force = contact.force_n
-        if self._drag is not None and query.drag_m is not None:
-            rows, drag_forces, drag_n = self._drag.solve(contact, query.drag_m)
-            total += self._sum(self._drag.influence, rows, drag_forces)
-            force = force + drag_n
+        total = self._sum(contact)
         return Response(
             displacement=total.reshape(-1, 3),
-            force_n=force * (query.depth_m / depth if query.depth_m > depth else 1.0),
+            force_n=contact.force_n * (query.depth_m / depth if query.depth_m > depth else 1.0),
             stiffness_n_per_m=stiffness,
             force_curve=curve,
             push_depth_m=max(0.0, query.depth_m - query.beyond_m),
@@ -509,13 +426,10 @@ class LinearSoftBody:
         result: Floats = np.maximum.accumulate(np.interp(bent, solved, forces) * grown)
         return result
 
-    def _sum(self, table: Singles, rows: Ints, forces: Floats) -> Singles:
-        """Return the displacement (3s,), m, that k nodal forces cause at s skin nodes.
-
-        table: influence matrix, m/N. rows (k,): rows of the matrix that belong to the forces.
-        forces (k,): forces, N.
-        """
-        scaled = (forces / self._modulus).astype(np.float32)
+    def _sum(self, contact: NormalContact) -> Singles:
+        """Return the displacement (3s,), m, that the nodal forces cause at the s skin nodes."""
+        table, rows = self._response.influence, contact.nodes
+        scaled = (contact.forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)
         # Slices of consecutive rows avoid the copy that fancy indexing would make.
         breaks = np.flatnonzero(np.diff(rows) != 1) + 1

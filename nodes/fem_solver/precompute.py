@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Plane
-from flexsheet.nodes.arrays import Bools, Floats, Ints, Singles
-from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields, make_digest
-from flexsheet.nodes.fem_solver.contact import DragResponse, SkinResponse
+from flexsheet.nodes.arrays import Bools, Floats, Singles
+from flexsheet.nodes.cache import Specification, cached, encode_fields, make_digest
+from flexsheet.nodes.fem_solver.contact import SkinResponse
 from flexsheet.nodes.fem_solver.mesh.from_scene import (
     BYTES_PER_NODE,
     MeshSpec,
@@ -31,9 +31,7 @@ from flexsheet.nodes.models.shapes import make_shape
 if TYPE_CHECKING:
     from flexsheet.nodes.fem_solver.multifrontal import Factors, NestedDissection
 
-Part = dict[str, NDArray[Any]]
-
-VERSION = 3
+VERSION = 4
 """The version of the computation. Increase it when results for the same specification change."""
 CHUNK_LOADS = 128
 ELEMENT_BYTES = 30 * 30 * 8
@@ -43,33 +41,19 @@ used for progress reports, in units of the time that one unit force needs."""
 
 Progress = Callable[[int, int, str], None]
 """A callback that receives the number of finished steps, the total number of steps, and a text
-about the required resources. The first call is before the work starts. The callback may raise
-`Interrupted` to stop the work."""
-
-
-class Interrupted(Exception):
-    """Raised when a computation is stopped on request. Its finished parts remain stored."""
+about the required resources. The first call is before the work starts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftBodySpec:
-    """The inputs of the precomputation of a body's linear response.
-
-    sticking: whether the response to tangential forces is also computed, for a finger that sticks
-    to the skin. Both responses together need three times the memory.
-    """
+    """The inputs of the precomputation of a body's linear response."""
 
     mesh: MeshSpec
     poisson_ratio: float
-    sticking: bool = False
-
-    @property
-    def loads_per_node(self) -> int:
-        return 3 if self.sticking else 1
 
     def depends_on(self) -> list[object]:
         """Return all inputs of the linear response as a JSON value."""
-        return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
+        return [VERSION, self.mesh.key(), self.poisson_ratio]
 
     def key(self) -> str:
         """Return a digest of the inputs and of `VERSION`, which identifies the linear response."""
@@ -84,13 +68,11 @@ class SoftBodyModel:
     triangles (t, 3): skin triangles with outward normals.
     bounds (s,): whether the finger must not touch each skin node, for example because the support
         fixes the node. Nodes on end faces are not marked.
-    drag: response to tangential forces; None if the finger does not stick to the skin.
     """
 
     response: SkinResponse
     triangles: NDArray[np.int32]
     bounds: Bools
-    drag: DragResponse | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,17 +103,12 @@ class ResponseBudget:
         )
 
 
-def compute_budget(
-    mesh: SolidMesh, order: NestedDissection, loads_per_node: int = 1
-) -> ResponseBudget:
-    """Return the resources that a precomputation with a given mesh and elimination order needs.
-
-    loads_per_node: number of unit forces on each touchable node.
-    """
+def compute_budget(mesh: SolidMesh, order: NestedDissection) -> ResponseBudget:
+    """Return the resources that a precomputation with a given mesh and elimination order needs."""
     factors = sum(len(f.pivots) * (len(f.pivots) + len(f.boundary)) for f in order.fronts) * 8
     stiffness = len(mesh.elements) * ELEMENT_BYTES * 3
     chunk = 3 * len(mesh.nodes) * CHUNK_LOADS * 8 * 4
-    loads = len(mesh.contact_nodes) * loads_per_node
+    loads = len(mesh.contact_nodes)
     table = loads * (len(mesh.skin) * 3 * 4 + loads * 8)
     return ResponseBudget(len(mesh.skin), loads, factors + stiffness + chunk, table)
 
@@ -147,21 +124,17 @@ def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
     loads, geometry = skin // 2, spec.mesh.geometry
     if isinstance(geometry, Plane):
         loads = int(geometry.width_m * geometry.height_m / spec.mesh.skin_spacing_m**2)
-    loads *= spec.loads_per_node
     return ResponseBudget(
         skin, loads, (BYTES_PER_NODE + 16_000) * nodes, loads * (skin * 12 + loads * 8)
     )
 
 
-def compute(
-    spec: SoftBodySpec, progress: Progress, checkpoints: CheckpointStore | None = None
-) -> SoftBodyModel:
+def compute(spec: SoftBodySpec, progress: Progress) -> SoftBodyModel:
     """Mesh the object, factor its stiffness matrix, and compute the response to a unit force on
     each touchable node.
 
-    checkpoints: store of finished parts, from which an interrupted computation can continue. Raises
-    UnfitMeshError if the object cannot be meshed, ValueError if the material or a size is invalid,
-    and MemoryError if the free memory is insufficient.
+    Raises UnfitMeshError if the object cannot be meshed, ValueError if the material or a size is
+    invalid, and MemoryError if the free memory is insufficient.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
@@ -175,7 +148,7 @@ def compute(
     need.require_memory(spec.mesh.skin_spacing_m)
     mesh = build_mesh(spec.mesh)
     order = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed)
-    need = compute_budget(mesh, order, spec.loads_per_node)
+    need = compute_budget(mesh, order)
     need.require_memory(spec.mesh.skin_spacing_m)
     done, total = 0, need.loads + MESH_STEPS + FACTOR_STEPS
 
@@ -192,21 +165,7 @@ def compute(
     del matrices
     advance(FACTOR_STEPS)
 
-    def make_part_getter(name: str) -> Callable[[int, Callable[[], Part]], Part]:
-        if checkpoints is None:
-            return lambda number, solve: solve()
-        return lambda number, solve: checkpoints.get(f"{name}-{number:06d}", solve)
-
-    influence, compliance = _solve_unit_loads(
-        mesh, factors, -mesh.contact_normals[:, None], make_part_getter("loads"), advance
-    )
-    drag = None
-    if spec.sticking:
-        tangents = make_tangents(mesh.contact_normals)
-        drag_influence, drag_compliance = _solve_unit_loads(
-            mesh, factors, tangents, make_part_getter("drags"), advance
-        )
-        drag = DragResponse(tangents, drag_compliance, drag_influence)
+    influence, compliance = _solve_unit_loads(mesh, factors, advance)
     contact_nodes = np.searchsorted(mesh.skin, mesh.contact_nodes)
     skin = mesh.nodes[mesh.skin]
     found = make_shape(dict(spec.mesh.geometry)).closest(skin)
@@ -222,60 +181,33 @@ def compute(
         compliance=compliance,
         influence=influence,
     )
-    return SoftBodyModel(response, mesh.skin_triangles, bounds, drag)
+    return SoftBodyModel(response, mesh.skin_triangles, bounds)
 
 
 def _solve_unit_loads(
-    mesh: SolidMesh,
-    factors: Factors,
-    directions: Floats,
-    get_part: Callable[[int, Callable[[], Part]], Part],
-    advance: Callable[[int], None],
+    mesh: SolidMesh, factors: Factors, advance: Callable[[int], None]
 ) -> tuple[Singles, Floats]:
-    """Compute the displacements for unit forces at m contact nodes, each in p directions.
+    """Compute the displacements for an inward unit force at each of the m contact nodes.
 
-    directions (m, p, 3): unit vectors.
-    get_part: function that returns the results of a group of loads. The arguments are the index of
-        the first load, and a function that computes the group if it is not stored.
     advance: function that receives the number of newly finished unit forces.
 
-    Returns two arrays of displacements per force, m/N. The first array (m p, 3s) contains the
-    displacements of the s skin nodes. The second array (m p, m p) contains the displacements of the
-    contact nodes along each direction.
+    Returns two arrays of displacements per force, m/N. The first array (m, 3s) contains the
+    displacements of the s skin nodes. The second array (m, m) contains the inward displacements of
+    the contact nodes.
     """
-    each = directions.shape[1]
-    loads = len(mesh.contact_nodes) * each
+    loads, inward = len(mesh.contact_nodes), -mesh.contact_normals
     influence = np.empty((loads, 3 * len(mesh.skin)), dtype=np.float32)
     compliance = np.empty((loads, loads))
     for start in range(0, loads, CHUNK_LOADS):
         numbers = np.arange(start, min(start + CHUNK_LOADS, loads))
-        node, which, count = numbers // each, numbers % each, len(numbers)
-
-        def solve_part(node: Ints = node, which: Ints = which, count: int = count) -> Part:
-            right = np.zeros((3 * len(mesh.nodes), count))
-            for axis in range(3):
-                right[3 * mesh.contact_nodes[node] + axis, np.arange(count)] = directions[
-                    node, which, axis
-                ]
-            moved = factors.solve(right).reshape(-1, 3, count)
-            along = np.einsum("mik,mpi->kmp", moved[mesh.contact_nodes], directions)
-            return {
-                "table": moved[mesh.skin].reshape(-1, count).T.astype(np.float32),
-                "compliance": along.reshape(count, loads),
-            }
-
-        part = get_part(start, solve_part)
-        influence[numbers], compliance[numbers] = part["table"], part["compliance"]
+        count = len(numbers)
+        right = np.zeros((len(mesh.nodes), 3, count))
+        right[mesh.contact_nodes[numbers], :, np.arange(count)] = inward[numbers]
+        moved = factors.solve(right.reshape(-1, count)).reshape(-1, 3, count)
+        influence[numbers] = moved[mesh.skin].reshape(-1, count).T
+        compliance[numbers] = np.einsum("mik,mi->km", moved[mesh.contact_nodes], inward)
         advance(count)
     return influence, 0.5 * (compliance + compliance.T)
-
-
-def make_tangents(normals: Floats) -> Floats:
-    """Return two perpendicular unit tangents (m, 2, 3) for each of the normals (m, 3)."""
-    smallest_axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    first = np.cross(normals, smallest_axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(normals, first)], axis=1)
 
 
 def require_memory(required_bytes: int, what: str, remedy: str) -> None:
@@ -294,34 +226,16 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
         )
 
 
-STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""The names of arrays in the cache file, by field name, where both names differ."""
-
-
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
-    """Define how the linear response of a soft body is stored in the cache.
-
-    The result consists of the cache key, a function that encodes a response, and a function that
-    decodes a stored response.
-    """
+    """Return the cache key of a linear response, with functions that encode and decode it."""
 
     def encode(model: SoftBodyModel) -> dict[str, NDArray[Any]]:
-        content = {"triangles": model.triangles, "bounds": model.bounds}
-        for prefix, part in (("", model.response), ("drag_", model.drag)):
-            if part is not None:
-                for name, array in encode_fields(part).items():
-                    content[prefix + STORED_NAMES.get(name, name)] = array
-        return content
+        own = {"triangles": model.triangles, "bounds": model.bounds}
+        return own | encode_fields(model.response)
 
     def decode(content: dict[str, NDArray[Any]]) -> SoftBodyModel:
-        field_names = {stored: name for name, stored in STORED_NAMES.items()}
-        parts: dict[bool, dict[str, NDArray[Any]]] = {False: {}, True: {}}
         triangles, bounds = content.pop("triangles"), content.pop("bounds")
-        for stored, array in content.items():
-            name = stored.removeprefix("drag_")
-            parts[name != stored][field_names.get(name, name)] = array
-        drag = DragResponse(**parts[True]) if spec.sticking else None
-        return SoftBodyModel(SkinResponse(**parts[False]), triangles, bounds, drag)
+        return SoftBodyModel(SkinResponse(**content), triangles, bounds)
 
     return Specification("soft-body", spec.depends_on(), encode, decode)
 
@@ -332,5 +246,4 @@ def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> 
     Raises UnfitMeshError if the object cannot be meshed, ValueError if the material or a size is
     invalid, and MemoryError if the free memory is insufficient.
     """
-    entry = response_cache(spec)
-    return cached(entry, cache_dir, lambda: compute(spec, progress, entry.checkpoints(cache_dir)))
+    return cached(response_cache(spec), cache_dir, lambda: compute(spec, progress))

@@ -8,9 +8,8 @@ snapshot is stored when it is finished.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import TypeVar
 import numpy as np
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields
 from flexsheet.nodes.fem_solver import precompute, snapshots
 from flexsheet.nodes.fem_solver.contact import unit_linear_body
@@ -37,36 +37,37 @@ from flexsheet.nodes.fem_solver.table import (
 )
 from flexsheet.nodes.models.shapes import make_shape
 
+K = TypeVar("K")
 T = TypeVar("T")
+Task = Callable[[], snapshots.Snapshot]
+"""A function without arguments that a worker process can run."""
 
-VERSION = 6
+VERSION = 7
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
 """The numbers of progress steps for each finished snapshot and for each finished table node."""
 POLL_S = 0.2
-"""The period of progress reports and stop checks while snapshots are solved, in seconds."""
+"""The period of progress reports while snapshots are solved, in seconds."""
 SNAPSHOT_BYTES = 600_000_000
 """The approximate memory that the solution of one snapshot needs, in bytes."""
+FINE_NAME = "fine"
+"""The name under which the push on the fine mesh is stored."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSpec:
-    """The inputs of the computation of a nonlinear table."""
+    """The inputs of the computation of a nonlinear table.
+
+    coarse: whether the table is computed from only a few pushes, in about a minute.
+    """
 
     body: SoftBodySpec
     finger_radius_m: float
+    coarse: bool = False
 
     def depends_on(self) -> list[object]:
         """Return all inputs of the table as a JSON value."""
-        return [VERSION, self.body.key(), self.finger_radius_m]
-
-
-stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", default=lambda: False)
-"""A function that returns whether a worker must stop its current job."""
-
-
-def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:
-    return snapshots.solve_snapshot(job, stop_requested.get())
+        return [VERSION, self.body.key(), self.finger_radius_m, self.coarse]
 
 
 class WorkersError(FlexsheetError, RuntimeError):
@@ -99,27 +100,63 @@ def compute_table(
     progress: Progress,
     *,
     workers: int = 1,
-    on_quick: Callable[[Table], None] | None = None,
 ) -> Table:
     """Load the cached table, or compute and store it.
 
     model: linear response of the same body. workers: number of workers of the executor on this
-    computer. on_quick: function that receives a coarse table long before the complete table is
-    ready; if it is None, no coarse table is computed. Raises MemoryError if this computer has too
-    little memory. Raises LostWorkersError if the executor loses its workers.
+    computer. Raises MemoryError if this computer has too little memory. Raises LostWorkersError if
+    the executor loses its workers.
     """
     entry = make_table_cache(spec)
-    checkpoints = entry.checkpoints(cache_dir)
 
     def compute() -> Table:
+        checkpoints = entry.checkpoints(cache_dir)
         for name, snapshot in load_shipped(shipped_path(entry)).items():
-            if checkpoints.load(name) is None:
-                checkpoints.save(name, encode_fields(snapshot))
-        return _compute_table(
-            spec, model, checkpoints, executor, progress, workers=workers, on_quick=on_quick
-        )
+            checkpoints.get(name, partial(encode_fields, snapshot))
+        return _compute_table(spec, model, checkpoints, executor, progress, workers=workers)
 
     return cached(entry, cache_dir, compute)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TablePushes:
+    """The pushes from which a table is computed.
+
+    samples: pushed surface points. names: names of their solutions. tasks: functions that compute
+    all solutions, by name. They include the push on the fine mesh at the first point, if the shape
+    permits such a mesh. mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
+    """
+
+    samples: list[snapshots.SamplePoint]
+    names: list[str]
+    tasks: dict[str, Task]
+    mirrors: list[Floats]
+
+
+def plan_pushes(spec: TableSpec) -> TablePushes:
+    """Choose the pushes from which a table is computed."""
+    mesh_spec, radius_m = spec.body.mesh, spec.finger_radius_m
+    mesh = build_mesh(mesh_spec)
+    mirrors = snapshots.find_mirror_planes(mesh)
+    samples = snapshots.order_by_spread(
+        snapshots.choose_sample_points(mesh_spec, mesh, mirrors, radius_m),
+        mirrors,
+        np.array(mesh_spec.towards_user),
+    )
+    depths_m = snapshots.COARSE_DEPTHS_M if spec.coarse else snapshots.DEPTHS_M
+    if spec.coarse:
+        samples = samples[: snapshots.COARSE_COUNT]
+    given = {"poisson_ratio": spec.body.poisson_ratio, "finger_radius_m": radius_m}
+    names = [f"push-{number:04d}" for number in range(len(samples))]
+    tasks: dict[str, Task] = {}
+    if snapshots.has_focused_meshes(mesh_spec):
+        # The push on the fine mesh takes longest, so it starts first.
+        tasks[FINE_NAME] = partial(snapshots.solve_fine_push, mesh_spec, samples[0], **given)
+    for name, sample in zip(names, samples, strict=True):
+        tasks[name] = partial(
+            snapshots.solve_push, mesh_spec, mesh, sample, depths_m=depths_m, **given
+        )
+    return TablePushes(samples, names, tasks, mirrors)
 
 
 def _compute_table(
@@ -130,75 +167,53 @@ def _compute_table(
     progress: Progress,
     *,
     workers: int,
-    on_quick: Callable[[Table], None] | None,
 ) -> Table:
-    mesh_spec, response = spec.body.mesh, model.response
-    mesh = build_mesh(mesh_spec)
-    mirrors = snapshots.find_mirror_planes(mesh)
-    user = np.array(mesh_spec.towards_user)
-    samples = snapshots.order_by_spread(
-        snapshots.choose_sample_points(mesh_spec, mesh, mirrors, spec.finger_radius_m),
-        mirrors,
-        user,
+    response, mesh_spec, radius_m = model.response, spec.body.mesh, spec.finger_radius_m
+    pushes = plan_pushes(spec)
+    loads, solving = len(response.contact_nodes), SNAPSHOT_STEPS * len(pushes.tasks)
+    depths = len(snapshots.DEPTHS_M)
+    required_bytes = workers * SNAPSHOT_BYTES + 2 * table_bytes(loads, len(response.rest), depths)
+    stage = "coarse" if spec.coarse else "complete"
+    need = (
+        f"{stage} table, {len(pushes.tasks)} snapshots for {loads} nodes, "
+        f"{required_bytes / 1e6:.0f} MB"
     )
-    given = {"poisson_ratio": spec.body.poisson_ratio, "finger_radius_m": spec.finger_radius_m}
-    fine_job = snapshots.make_fine_job(mesh_spec, samples[0], **given)
-    linear = unit_linear_body(
+
+    def report(steps: int) -> None:
+        progress(steps, solving + NODE_STEPS * loads, need)
+
+    report(0)
+    precompute.require_memory(
+        required_bytes,
+        f"the computation of the nonlinear table of the soft body ({need})",
+        f'increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "linear"',
+    )
+    solved = solve_all(
+        pushes.tasks, executor, checkpoints, lambda count: report(SNAPSHOT_STEPS * count)
+    )
+    return fill_table(
         response,
-        make_shape(dict(mesh_spec.geometry)),
-        response.rest[model.bounds],
-        spec.finger_radius_m,
-    )
-    loads = len(response.contact_nodes)
-    table = table_bytes(loads, len(response.rest), len(snapshots.DEPTHS_M))
-
-    def compute_stage(
-        name: str, stage: str, some: list[snapshots.SamplePoint], depths_m: tuple[float, ...]
-    ) -> Table:
-        jobs = [
-            snapshots.make_snapshot_job(mesh_spec, mesh, sample, depths_m=depths_m, **given)
-            for sample in some
-        ]
-        names = [f"{name}-{number:04d}" for number in range(len(jobs))]
-        if fine_job is not None:
-            # Both stages need the fine push. The second stage loads it from the checkpoints.
-            jobs, names = [fine_job, *jobs], ["fine", *names]
-        solving = SNAPSHOT_STEPS * len(jobs)
-        required_bytes = 2 * table + workers * SNAPSHOT_BYTES
-        need = (
-            f"{stage} table, {len(jobs)} snapshots for {loads} nodes, {required_bytes / 1e6:.0f} MB"
-        )
-
-        def report(steps: int) -> None:
-            progress(steps, solving + NODE_STEPS * loads, need)
-
-        report(0)
-        precompute.require_memory(
-            required_bytes,
-            f"the computation of the nonlinear table of the soft body ({need})",
-            f"increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "
-            '"linear"',
-        )
-        solved = solve_all(
-            jobs, executor, checkpoints, lambda count: report(SNAPSHOT_STEPS * count), names=names
-        )
-        return fill_table(
+        model.triangles,
+        unit_linear_body(
             response,
-            model.triangles,
-            linear,
-            SnapshotSet(some, solved[-len(some) :], mirrors, user, spec.finger_radius_m),
-            fine=None if fine_job is None else (samples[0], solved[0]),
-            interpolate=partial(
-                _interpolate_by,
-                executor,
-                lambda done, total: report(solving + NODE_STEPS * loads * done // total),
-            ),
-        )
-
-    if on_quick is not None:
-        some = samples[: snapshots.QUICK_COUNT]
-        on_quick(compute_stage("quick", "coarse", some, snapshots.QUICK_DEPTHS_M))
-    return compute_stage("push", "complete", samples, snapshots.DEPTHS_M)
+            make_shape(dict(mesh_spec.geometry)),
+            response.rest[model.bounds],
+            radius_m,
+        ),
+        SnapshotSet(
+            pushes.samples,
+            [solved[name] for name in pushes.names],
+            pushes.mirrors,
+            np.array(mesh_spec.towards_user),
+            radius_m,
+        ),
+        fine=(pushes.samples[0], solved[FINE_NAME]) if FINE_NAME in solved else None,
+        interpolate=partial(
+            _interpolate_by,
+            executor,
+            lambda done, total: report(solving + NODE_STEPS * loads * done // total),
+        ),
+    )
 
 
 def _interpolate_by(
@@ -223,21 +238,21 @@ def _interpolate_by(
 
 
 def _collect(
-    waiting: dict[Future[T], int],
-    on_result: Callable[[int, T], None],
+    waiting: dict[Future[T], K],
+    on_result: Callable[[K, T], None],
     on_progress: Callable[[], None],
 ) -> None:
     """Wait for all futures, and cancel the pending futures after an exception.
 
-    waiting: futures, each with an index. on_result: function that receives the index and the result
-    of each future. on_progress: function that is called periodically. Raises LostWorkersError if
-    the executor loses its workers. Also raises the errors of the futures.
+    waiting: futures, each with a key. on_result: function that receives the key and the result of
+    each future. on_progress: function that is called periodically. Raises LostWorkersError if the
+    executor loses its workers. Also raises the errors of the futures.
     """
     try:
         while waiting:
             done, _ = wait(waiting, timeout=POLL_S, return_when=FIRST_COMPLETED)
             for future in done:
-                number = waiting.pop(future)
+                key = waiting.pop(future)
                 try:
                     result = future.result()
                 except CancelledError as error:
@@ -246,7 +261,7 @@ def _collect(
                         "lost; restart them and repeat the command, which loads the finished "
                         "snapshots and solves the missing ones"
                     ) from error
-                on_result(number, result)
+                on_result(key, result)
             on_progress()
     finally:
         for future in waiting:
@@ -254,36 +269,29 @@ def _collect(
 
 
 def solve_all(
-    jobs: list[snapshots.SnapshotJob],
+    tasks: Mapping[str, Task],
     executor: Executor,
     checkpoints: CheckpointStore,
     on_progress: Callable[[int], None],
-    *,
-    names: Sequence[str] = (),
-) -> list[snapshots.Snapshot]:
-    """Load the solutions (snapshots) of jobs from a store; compute and store missing ones.
+) -> dict[str, snapshots.Snapshot]:
+    """Load solutions (snapshots) from a store; compute and store missing ones.
 
+    tasks: functions that compute the solutions, with the names of the stored solutions as keys.
     on_progress: function that receives the number of finished snapshots. It may raise an exception
-    to cancel the pending jobs. names: names of the stored snapshots. If `names` is empty, the names
-    are "push-0000", "push-0001" and so on. Raises LostWorkersError if the executor loses its
-    workers. Also raises the errors of the jobs.
+    to cancel the pending tasks. Raises LostWorkersError if the executor loses its workers. Also
+    raises the errors of the tasks.
     """
-    names = names or [f"push-{number:04d}" for number in range(len(jobs))]
-    solved: dict[int, snapshots.Snapshot] = {}
-    for number in range(len(jobs)):
-        part = checkpoints.load(names[number])
+    solved: dict[str, snapshots.Snapshot] = {}
+    for name in tasks:
+        part = checkpoints.load(name)
         if part is not None:
-            solved[number] = snapshots.decode_snapshot(part)
+            solved[name] = snapshots.decode_snapshot(part)
     on_progress(len(solved))
-    waiting: dict[Future[snapshots.Snapshot], int] = {
-        executor.submit(_solve, job): number
-        for number, job in enumerate(jobs)
-        if number not in solved
-    }
+    waiting = {executor.submit(task): name for name, task in tasks.items() if name not in solved}
 
-    def store(number: int, snapshot: snapshots.Snapshot) -> None:
-        checkpoints.save(names[number], encode_fields(snapshot))
-        solved[number] = snapshot
+    def store(name: str, snapshot: snapshots.Snapshot) -> None:
+        checkpoints.save(name, encode_fields(snapshot))
+        solved[name] = snapshot
 
     _collect(waiting, store, lambda: on_progress(len(solved)))
-    return [solved[number] for number in range(len(jobs))]
+    return solved

@@ -9,7 +9,6 @@ solve it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,10 +42,9 @@ solution, but the computation time is halved."""
 MIN_VOLUME_RATIO = 0.2
 """The minimum ratio of deformed to undeformed volume of any element. A push ends at this ratio.
 Below this ratio, the solution at the next depth would not converge."""
-QUICK_DEPTHS_M = (0.0025, 0.005, 0.010)
-QUICK_COUNT = 9
-"""The number of sample points of the coarse table, which is computed first. `QUICK_DEPTHS_M`
-contains its push depths."""
+COARSE_DEPTHS_M = (0.0025, 0.005, 0.010)
+COARSE_COUNT = 9
+"""The push depths and the number of sample points of a coarse table."""
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
 """The parameters of the fine mesh that corrects the forces. The first is the ratio of its skin
@@ -61,10 +59,6 @@ MAX_ELEMENT_RATIO = 0.35
 """The maximum element size in meshes of bisected lattices, as a fraction of the body's minimum
 extent."""
 SAME_RATIO = 1e-6
-
-
-class SnapshotCancelledError(Exception):
-    """Raised when the computation of a snapshot is cancelled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +113,10 @@ class Snapshot:
     reached: int
 
 
-def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False) -> Snapshot:
+def solve_snapshot(job: SnapshotJob) -> Snapshot:
     """Compute the snapshot that a job describes.
 
-    stopped: function that returns true to cancel the solution. Raises SnapshotCancelledError if the
-    solution is cancelled, SolidMeshError if an element is inverted, and ValueError if the material
-    is invalid.
+    Raises SolidMeshError if an element is inverted, and ValueError if the material is invalid.
     """
     from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # scipy is slow to import
 
@@ -150,8 +142,6 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
     ]
     states = []
     for state in body.solve_load_steps(path):
-        if stopped():
-            raise SnapshotCancelledError
         states.append(state)
         if state.min_volume_ratio < MIN_VOLUME_RATIO:
             break
@@ -315,17 +305,16 @@ def make_snapshot_job(
 
 def make_fine_job(
     spec: MeshSpec, sample: SamplePoint, *, poisson_ratio: float, finger_radius_m: float
-) -> SnapshotJob | None:
+) -> SnapshotJob:
     """Return the inputs for computing pushes at one surface point with an especially fine mesh.
 
-    The forces on this mesh correct the forces of the nonlinear table. Returns None if the shape
-    does not permit a mesh that is fine only near one point.
+    The forces on this mesh correct the forces of the nonlinear table. The shape must permit a mesh
+    that is fine only near one point (`has_focused_meshes`).
     """
     spacing_m = FINE_RATIO * _spacing_m(spec, finger_radius_m)
     near_m = FINE_NEAR_RATIO * finger_radius_m
     mesh = _make_focused_mesh(spec, sample, spacing_m, near_m, FINE_GROWTH)
-    if mesh is None:
-        return None
+    assert mesh is not None
     return make_job_on_mesh(
         mesh,
         sample,
@@ -334,6 +323,16 @@ def make_fine_job(
         depths_m=FINE_DEPTHS_M,
         mirror_axes=_mirror_axes(spec, sample),
     )
+
+
+def solve_push(spec: MeshSpec, mesh: SolidMesh, sample: SamplePoint, **given: Any) -> Snapshot:
+    """Make the job of a push with the arguments of `make_snapshot_job`, and solve it."""
+    return solve_snapshot(make_snapshot_job(spec, mesh, sample, **given))
+
+
+def solve_fine_push(spec: MeshSpec, sample: SamplePoint, **given: Any) -> Snapshot:
+    """Make the job of a push with the arguments of `make_fine_job`, and solve it."""
+    return solve_snapshot(make_fine_job(spec, sample, **given))
 
 
 def _spacing_m(spec: MeshSpec, finger_radius_m: float) -> float:

@@ -1,7 +1,10 @@
 """Compute and cache the deflection shapes of the pushed sheet.
 
-The computation takes half a minute. Shapes are stored for a few finger radii and sheet widths.
-For other radii, the stored shapes are interpolated. For other widths, they are scaled.
+The computation takes a minute on two cores. Shapes are stored for a few finger radii and sheet
+widths. For other radii, the stored shapes are interpolated. For other widths, they are scaled. The
+folder `shapes` of the package contains the shapes of the shipped scenes. The file names contain the
+key of the cache, so outdated shapes are not used. The command `python -m benchmarks.ship_tables`
+writes them.
 """
 
 from __future__ import annotations
@@ -35,6 +38,8 @@ STRETCH_SLACK = 0.01
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
 """The names of the fields of `IndentationBasis` that the cache file contains."""
+
+FOLDER = Path(__file__).with_name("shapes")
 
 MAX_DEPTH_RATIO = 1.2
 """The maximum push depth that is computed, divided by the maximum push depth of the scene."""
@@ -84,7 +89,7 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
             rubber,
             scene.finger.radius_m,
             within.deepest_m,
-            *(content[name] for name in FIELDS),
+            *(content[name].astype(np.float64) for name in FIELDS),
         )
 
     return Specification(
@@ -147,7 +152,8 @@ def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
     """
     parts = []
     for weight, stored in list_stored(scene):
-        basis = load_cached(shapes_cache(stored), cache_dir)
+        entry = shapes_cache(stored)
+        basis = load_cached(entry, cache_dir) or load_cached(entry, FOLDER)
         if basis is None:
             return None
         parts.append((weight, basis))
@@ -180,10 +186,14 @@ def _load_or_solve(scene: Scene, cache_dir: Path | None, progress: Progress) -> 
                 progress(done, len(pushes))
                 yield solved
 
+    entry = shapes_cache(scene)
     return cached(
-        shapes_cache(scene),
+        entry,
         cache_dir,
-        lambda: solve_indentation_basis(
-            rubber, within=within, finger_radius_m=scene.finger.radius_m, solve_all=solve_all
+        lambda: (
+            load_cached(entry, FOLDER)
+            or solve_indentation_basis(
+                rubber, within=within, finger_radius_m=scene.finger.radius_m, solve_all=solve_all
+            )
         ),
     )
