@@ -82,14 +82,6 @@ def split_annotation(annotation: Any) -> tuple[Any, ArraySpec | None]:
     return annotation, spec
 
 
-def is_image(spec: ArraySpec) -> bool:
-    """Return whether an array specification describes an image.
-
-    An image is an array in which more than one axis has a variable length.
-    """
-    return sum(isinstance(length, str) for length in spec.shape) > 1
-
-
 def _type(annotation: Any) -> str:
     annotation, spec = split_annotation(annotation)
     if spec is not None:

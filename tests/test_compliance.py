@@ -261,7 +261,7 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     curve = soft_curve(scale)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
     monkeypatch.setattr("flexsheet.launch.health.compliance.compute_front_curve", lambda *_: rows)
-    command = ["doctor", "scene", str(SCENE_FILE), "--compliance"]
+    command = ["doctor", "--scene", str(SCENE_FILE), "--compliance"]
     result = CliRunner().invoke(app, [*command, "--json"])
     assert result.exit_code == code, result.output
     reported = json.loads(result.stdout)
@@ -311,7 +311,7 @@ def test_the_risk_of_the_loop_follows_from_object_and_delay(
 def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
     missing = str(tmp_path / "none.yaml")
     result = CliRunner().invoke(
-        app, ["doctor", "scene", str(SCENE_FILE), "--compliance", "--calibration", missing]
+        app, ["doctor", "--scene", str(SCENE_FILE), "--compliance", "--calibration", missing]
     )
     assert isinstance(result.exception, CalibrationFileError)
     assert exit_code(result.exception) == BAD_INPUT

@@ -367,9 +367,9 @@ def test_a_speed_that_is_too_high_gives_a_warning(
     assert slower.speed_m_per_s < ball.working_range.speed_m_per_s
     assert check_layout(ball.model_copy(update={"working_range": slower})).followed.all()
     monkeypatch.setattr(layout, "check_layout", lambda *_: found)
-    code, out, err = flexsheet("doctor", "scene", SCENE_FILE)
+    code, out, err = flexsheet("doctor", "--scene", SCENE_FILE)
     assert code == 0
-    assert f"flexsheet doctor scene {SCENE_FILE} --compliance" in err
+    assert f"flexsheet doctor --scene {SCENE_FILE} --compliance" in err
     assert re.search(r"^warning: the arms follow \d+ mm/s at only [\d.]+ % of", out, re.M)
 
 
@@ -393,7 +393,7 @@ def test_every_shape_can_be_asked(geometry: dict[str, Any], reachable: bool) -> 
 
 
 def test_the_exit_code_of_a_reachable_scene_is_0(flexsheet: Command) -> None:
-    code, out, _ = flexsheet("doctor", "scene", SCENE_FILE, "--json")
+    code, out, _ = flexsheet("doctor", "--scene", SCENE_FILE, "--json")
     assert code == 0
     assert json.loads(out)["reachable"] is True
 
@@ -413,7 +413,7 @@ def test_the_command_fails_and_names_the_limits(
     far = tmp_path / "far.yaml"
     text = SCENE_FILE.read_text()
     far.write_text(text.replace("position_m: [-0.5, -0.45, 0.0]", "position_m: [-0.6, -0.5, 0.06]"))
-    code, out, _ = flexsheet("doctor", "scene", far)
+    code, out, _ = flexsheet("doctor", "--scene", far)
     assert code == 1
     assert re.search(r"^reachable +NO$", out, re.M)
     assert re.search(r"^left +reach +[\d.]+ %", out, re.M)
@@ -429,6 +429,6 @@ def test_the_command_fails_and_names_the_limits(
 def test_bad_input_to_the_command_is_named(
     flexsheet: Command, arguments: list[object], words: str
 ) -> None:
-    code, _, err = flexsheet("doctor", "scene", *arguments)
+    code, _, err = flexsheet("doctor", "--scene", *arguments)
     assert code == 2
     assert words in err

@@ -16,7 +16,7 @@ from flexsheet.launch.commands.doctor_hosts import (
     check_running_graph,
     print_findings,
 )
-from flexsheet.launch.commands.options import JsonOption, SceneArgument
+from flexsheet.launch.commands.options import JsonOption
 from flexsheet.launch.commands.output import (
     FAILED,
     examples,
@@ -28,21 +28,19 @@ from flexsheet.launch.commands.output import (
 )
 from flexsheet.messages.units import format_percent
 
-app = typer.Typer(
-    add_completion=False,
-    invoke_without_command=True,
-    help="Check this computer, and all hosts of the running graph.",
+app = options.make_app()
+
+
+@app.command(
     epilog=examples(
         "flexsheet doctor",
         "flexsheet doctor --launch launch/lab.yaml --host left",
-        "flexsheet doctor --sweep",
+        "flexsheet doctor --scene cylinder",
+        "flexsheet doctor --scene cylinder --compliance --delay-ms 80",
     ),
 )
-
-
-@app.callback()
 def doctor(
-    context: typer.Context,
+    *,
     sweep: Annotated[
         bool,
         typer.Option(
@@ -62,14 +60,55 @@ def doctor(
             help="Name of this computer in the launch file; default: determined from its address.",
         ),
     ] = None,
+    scene_file: Annotated[
+        Path | None,
+        typer.Option("--scene", help="Check only this scene, not the computer.", **options.SCENE),
+    ] = None,
+    compliance: Annotated[
+        bool,
+        typer.Option(
+            "--compliance",
+            help="With --scene: check that the sheet can feel as soft as the object.",
+        ),
+    ] = False,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="With --compliance: file from `flexsheet calibrate sheet`."),
+    ] = None,
+    delay_ms: Annotated[
+        float,
+        typer.Option(
+            metavar="MS",
+            min=0.0,
+            max=500.0,
+            help="With --compliance: delay from a measurement of the finger's depth to the sheet's "
+            "motion, ms.",
+        ),
+    ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that this computer can run flexsheet.
+    """Check that this computer can run flexsheet, or that the arms can present a scene.
 
     If a graph of several computers is running, all of them are checked. With --launch, the
     connections to all hosts of this launch file are checked. The exit code is 1 if a check fails.
+
+    With --scene, the command checks samples of all tilts and push depths in the working range of
+    the scene, at the minimum and the maximum stretch of the sheet. It prints the maximum finger
+    speed that the arms can follow, and a warning if the scene's maximum is greater.
+
+    The joint solutions of an RV-1A or RV-2FR have names. "Shoulder front" means that the wrist
+    centre is in front of the plane through the axes of J1 and J2. "Elbow up" means that J3 is
+    greater than the angle at which the arm is straight. "Wrist flipped" means that J5 is negative.
+
+    With --compliance, the command compares the force of the object's model with the rendered force
+    for pushes at the centre, and checks that hand and sheet cannot oscillate. The first call
+    computes the object's model, which takes minutes.
     """
-    if context.invoked_subcommand is not None:
+    if scene_file is not None and compliance:
+        check_compliance(scene_file, calibration, delay_ms=delay_ms, as_json=as_json)
+        return
+    if scene_file is not None:
+        check_scene(scene_file, as_json=as_json)
         return
     from flexsheet.launch.health.doctor import check_computer
     from flexsheet.launch.running.runs import sweep as sweep_leftovers
@@ -91,57 +130,11 @@ def doctor(
         raise typer.Exit(FAILED)
 
 
-@app.command(
-    "scene",
-    epilog=examples(
-        "flexsheet doctor scene launch/scenes/cylinder.yaml",
-        "flexsheet doctor scene launch/scenes/cylinder.yaml --compliance --delay-ms 80",
-    ),
-)
-def check_scene(
-    *,
-    scene_file: SceneArgument,
-    compliance: Annotated[
-        bool,
-        typer.Option(
-            "--compliance",
-            help="Instead, check that the sheet can feel as soft as the virtual object.",
-        ),
-    ] = False,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="With --compliance: file from `flexsheet calibrate sheet`."),
-    ] = None,
-    delay_ms: Annotated[
-        float,
-        typer.Option(
-            metavar="MS",
-            min=0.0,
-            max=500.0,
-            help="With --compliance: delay from a measurement of the finger's depth to the sheet's "
-            "motion, ms.",
-        ),
-    ] = 60.0,
-    as_json: JsonOption = False,
-) -> None:
-    """Check that both arms reach the whole working range of a scene.
+def check_scene(scene_file: Path, *, as_json: bool) -> None:
+    """Check that both arms reach the working range of a scene, and print the result.
 
-    The command checks samples of all tilts and push depths in the range, at the minimum and the
-    maximum stretch of the sheet. It prints the maximum finger speed that the arms can follow. The
-    exit code is 1 if the arms cannot reach a sample. A warning is printed if they reach all samples
-    but cannot follow the maximum finger speed of the scene.
-
-    The joint solutions of an RV-1A or RV-2FR have names. "Shoulder front" means that the wrist
-    centre is in front of the plane through the axes of J1 and J2. "Elbow up" means that J3 is
-    greater than the angle at which the arm is straight. "Wrist flipped" means that J5 is negative.
-
-    With --compliance, the command compares the force of the object's model with the rendered force
-    for pushes at the centre, and checks that hand and sheet cannot oscillate. The first call
-    computes the object's model, which takes minutes.
+    Raises typer.Exit with the exit code 1 if the arms cannot reach a sample.
     """
-    if compliance:
-        check_compliance(scene_file, calibration, delay_ms=delay_ms, as_json=as_json)
-        return
     from flexsheet.launch.health.layout import check_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
 
@@ -156,7 +149,7 @@ def check_scene(
         if scene.object.material is not None:
             words.print(
                 "whether the sheet can be as stiff as the object is a separate check: flexsheet "
-                f"doctor scene {scene_file} --compliance"
+                f"doctor --scene {scene_file} --compliance"
             )
     if not layout.reachable:
         raise typer.Exit(FAILED)

@@ -1,4 +1,4 @@
-"""Check that the sheet can feel as soft as the virtual object: `doctor scene --compliance`."""
+"""Check that the sheet can feel as soft as the virtual object of a scene."""
 
 from __future__ import annotations
 

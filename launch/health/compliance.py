@@ -154,7 +154,7 @@ def compliance_result(
     delay_s: float,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
-    """Return the result of `flexsheet doctor scene --json --compliance`.
+    """Return the result of `flexsheet doctor --scene SCENE --json --compliance`.
 
     law: force model of the sheet.
     curve: force of the object as a function of push depth.

@@ -312,7 +312,7 @@ def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -
 
 
 def make_layout_result(layout: Layout) -> dict[str, Any]:
-    """Return the result of `flexsheet doctor scene --json`."""
+    """Return the result of `flexsheet doctor --scene SCENE --json`."""
     return {
         "scene": layout.scene.name,
         "reachable": layout.reachable,

@@ -65,7 +65,7 @@ class UnreachableError(FlexsheetError, ValueError):
         solution.
     """
 
-    remedy = "Run `flexsheet doctor scene SCENE`, which lists the limits."
+    remedy = "Run `flexsheet doctor --scene SCENE`, which lists the limits."
 
     def __init__(self, text: str, limit: str) -> None:
         super().__init__(text)
