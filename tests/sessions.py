@@ -125,7 +125,7 @@ def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
     recording = {"clock_id": "clock", "started": "2026-11-22T10:00:00+00:00",
                  "started_ns": str(START_NS)}  # fmt: skip
     with BagWriter(path, {"recording": recording}) as writer:
-        writer.add_attachment("git.json", b'{"commit": "abc", "changed": true}', "application/json")
+        writer.add_attachment("git.json", b'{"commit": "abc"}', "application/json")
         desk = MessageWriter(writer, leave_out)
         desk.write("scene", SCENE, 0.0)
         for i in range(round(ENDS_S * RATE_HZ)):

@@ -98,7 +98,6 @@ class RunningGraph:
         self.exit_codes: dict[str, int] = {}
         self.restarts: dict[str, int] = {node.name: 0 for node in self.nodes}
         self.hangs: dict[str, int] = {node.name: 0 for node in self.nodes}
-        self.failure: NodeFailedError | None = None
         self._run: Run | None = None
         self._children: dict[str, Child] = {}
         self._supervisors: dict[str, asyncio.Task[None]] = {}
@@ -463,9 +462,8 @@ class RunningGraph:
                 self._report(LAUNCHER, f"scene {path.name} is skipped: {error}")
 
     def _fail(self, text: str) -> NodeFailedError:
-        self.failure = NodeFailedError(f"{text}; its log is in {self.run.logs}")
         self._report(LAUNCHER, text)
-        return self.failure
+        return NodeFailedError(f"{text}; its log is in {self.run.logs}")
 
     def _report(self, node: str, line: str) -> None:
         if node == LAUNCHER and self._run is not None:

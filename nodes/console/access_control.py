@@ -31,8 +31,6 @@ The web site of an attacker could make its own name resolve to this computer (DN
 class ConsoleError(FlexsheetError, RuntimeError):
     """The error raised if the console cannot serve the page."""
 
-    remedy = "Choose another port."
-
 
 def is_allowed(request: Request) -> bool:
     """Return whether a request names this computer, and does not come from a page of another site.
