@@ -59,6 +59,8 @@ class Note(MessagePart):
 
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
+IF_IT_GROWS = "If the number grows steadily, check row `load` of `flexsheet doctor`."
+
 NOTE_REMEDIES: dict[NoteCode, str] = {
     NoteCode.WAITING_FOR_SCENE: "Wait a few seconds. If it remains, read `flexsheet logs`.",
     NoteCode.ARM_BLOCKED: "Move the arms nearer to the sheet by hand, or move the sheet.",
@@ -71,10 +73,10 @@ NOTE_REMEDIES: dict[NoteCode, str] = {
     NoteCode.COMMANDS_UNANSWERED: BUSY_FIRST + "Then check the cable and the network of the arm.",
     NoteCode.EYES_OF_SCENE: "Check the program that measures the eyes: `flexsheet topic echo eye`.",
     NoteCode.FINGER_PATH_REFUSED: "Correct the path, and publish it again: `flexsheet topic pub`.",
-    NoteCode.FINGERTIPS_LATE: "If the number grows steadily: " + BUSY_FIRST,
+    NoteCode.FINGERTIPS_LATE: IF_IT_GROWS,
     NoteCode.FORCE_LIMITED: "Choose another object or sheet: docs/hand-in-the-loop.md.",
     NoteCode.FRAME_NOT_RENDERED: "Set `stereo` of the topic `display` to `mono`.",
-    NoteCode.FRAMES_MISSED: "If the number grows steadily: " + BUSY_FIRST,
+    NoteCode.FRAMES_MISSED: IF_IT_GROWS,
     NoteCode.NO_IMAGES: "Correct the cable, the device, or the file of the parameter `source`.",
     NoteCode.NO_PROJECTOR: "Add `projector` to the scene if an image is wanted.",
     NoteCode.NOT_RECORDING: "Free space on the disk; the next bag then starts automatically.",
