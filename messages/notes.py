@@ -53,9 +53,8 @@ class Note(MessagePart):
     detail: str = Field(default="", description="text for people, which programs do not evaluate")
 
     def __str__(self) -> str:
-        if self.code is NoteCode.INFO:
-            return self.detail
-        return f"{self.code}: {self.detail}" if self.detail else self.code
+        parts = (self.code if self.code is not NoteCode.INFO else "", self.detail)
+        return ": ".join(filter(None, parts))
 
 
 BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "

@@ -530,15 +530,6 @@ class Node:
         """Replace the notes in the node's status by the notes whose detail is not empty."""
         self.notes = tuple(Note(code=code, detail=text) for code, text in details.items() if text)
 
-    @property
-    def note(self) -> str:
-        """Return the text of the notes."""
-        return "; ".join(map(str, self.notes))
-
-    @note.setter
-    def note(self, text: str) -> None:
-        self.notes = (Note(detail=text),) if text else ()
-
     def report_error(self, what: str, error: Exception) -> None:
         """Count an error, report it in the status message, and log it.
 

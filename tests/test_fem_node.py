@@ -24,6 +24,7 @@ from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
 from flexsheet.nodes.fem_solver.table import Table
 from tests.fingertips import fingertip as even_fingertip
 from tests.node_harness import NodeHarness
+from tests.note_text import note_text
 from tests.scenes import load_values
 
 SPACING_M = 0.007
@@ -100,7 +101,7 @@ async def test_nothing_is_published_before_a_scene(cache: str) -> None:
     await bench.node.setup()
     await bench.node.step("fingertip", fingertip((0, 0, 0)), header())
     assert bench.sent == []
-    assert "scene" in bench.node.note
+    assert "scene" in note_text(bench.node)
 
 
 async def test_the_skin_has_the_pose_of_the_scene(bench: Bench) -> None:
@@ -109,7 +110,7 @@ async def test_the_skin_has_the_pose_of_the_scene(bench: Bench) -> None:
     low, high = skin.vertices_world_m.min(axis=0), skin.vertices_world_m.max(axis=0)
     assert low == pytest.approx([-0.06, -0.0353553, -0.0707106], abs=2e-3)
     assert high == pytest.approx([0.06, 0.0353553, 0.0], abs=2e-3)
-    assert bench.node.note.startswith("soft body by linear, force error up to ")
+    assert note_text(bench.node).startswith("soft body by linear, force error up to ")
 
 
 async def test_a_push_deforms_the_skin_towards_the_back(bench: Bench) -> None:
@@ -221,7 +222,7 @@ async def test_an_impossible_object_is_an_error_with_its_reason(
     await bench.node.step("scene", scene(**change), header())
     assert bench.node.errors == 1
     assert words in bench.node.last_error
-    assert words in bench.node.note
+    assert words in note_text(bench.node)
     await bench.node.step("fingertip", fingertip((0, 0, 0)), header())
     assert bench.sent == []
 
@@ -264,8 +265,8 @@ async def test_a_cached_table_is_used(
     answer = await bench.push(fingertip((0.0, 0.0, -0.003)))
     assert answer.method == ("coarse_table" if coarse else "nonlinear_table")
     assert answer.force_world_n[2] == pytest.approx(4000.0 * 0.01 * 0.003, rel=1e-3)
-    assert bench.node.note.startswith(f"soft body by {answer.method}, force error up to ")
-    assert "precompute" not in bench.node.note
+    assert note_text(bench.node).startswith(f"soft body by {answer.method}, force error up to ")
+    assert "precompute" not in note_text(bench.node)
     assert bench.node.errors == 0, bench.node.last_error
 
 
@@ -275,5 +276,5 @@ async def test_a_missing_table_is_reported_and_not_computed(cache: str) -> None:
     await bench.node.step("scene", scene(), header())
     assert (await bench.push(fingertip((0.0, 0.0, -0.003)))).method == "linear"
     assert [note.code for note in bench.node.notes] == [NoteCode.SOFT_BODY_TABLE_MISSING]
-    assert bench.node.note.endswith("run flexsheet precompute SCENE")
+    assert note_text(bench.node).endswith("run flexsheet precompute SCENE")
     assert not any("table" in path.name for path in Path(cache).iterdir())  # noqa: ASYNC240

@@ -53,7 +53,7 @@ class FemSolver(Node):
     async def on_scene(self, scene: Scene, header: Header) -> None:
         self._reset()
         if scene.object.material is None:
-            self.note = "no soft body: the object is rigid"
+            self.set_note(NoteCode.INFO, "no soft body: the object is rigid")
             return
         p = self.parameters
         choice = choose_method(scene, p.method, p.skin_spacing_m)
@@ -64,7 +64,7 @@ class FemSolver(Node):
             self.set_note(NoteCode.SOFT_BODY_FAILED, str(error))
             raise
         self._body = built
-        self.note = describe(built)
+        self.set_note(NoteCode.INFO, describe(built))
         if choice.method == "nonlinear_table" and built.method.name == "linear":
             detail = f"{describe(built)}; {cache.advise_precompute(scene)}"
             self.set_note(NoteCode.SOFT_BODY_TABLE_MISSING, detail)
