@@ -115,12 +115,11 @@ class NodeTransport:
             if output.endpoints:
                 topic = find_topic(output.topic)
                 endpoints = [str(one) for one in output.endpoints]
-                on_refused = self._make_refusal_handler(node.outputs[output.port].counts, topic)
                 self._publishers[topic.name] = Publisher(
                     topic,
                     endpoints,
                     keys=self._keys,
-                    on_refused=on_refused,
+                    on_refused=self._make_refusal_handler(node.outputs[output.port].counts, topic),
                     local=self._local,
                 )
 

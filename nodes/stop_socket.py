@@ -39,9 +39,11 @@ class StopSocket:
         """
         self._path.unlink(missing_ok=True)
         self._server = await asyncio.start_unix_server(
-            self._answer, self._path, limit=MAX_REQUEST_BYTES
+            self._answer, self._path, limit=MAX_REQUEST_BYTES, start_serving=False
         )
         self._path.chmod(0o600)
+        # If this call is cancelled, `close` closes the server.
+        await self._server.start_serving()
 
     def close(self) -> None:
         """Close the socket, and remove its file. This has no effect on a closed socket."""
