@@ -103,7 +103,7 @@ class Family:
     trials: Callable[[Scene], Iterable[Trial]]
     tolerance: Callable[[Scene], float]
     sweep_key: str | None = None
-    prepare: Callable[[Scene, Progress], None] = prepare_nothing
+    prepare: Callable[[Scene, Progress], object] = prepare_nothing
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,7 @@ def measure_family(
 
     select: function that returns whether to measure a given trial.
     """
-    on_progress = report_time_left(f"{family.name}: computing the reference", progress)
+    on_progress = report_time_left(f"{family.name}: computing what the methods need", progress)
     family.prepare(scene, on_progress)
     points: list[Point] = []
     last_s = -math.inf

@@ -36,11 +36,10 @@ ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure
 sheet's left and right edges, and the fingertip (3,), m. The fingertip is None if the sheet is not
 pushed."""
 
-CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TWO_PASS_TRIANGLES = "two_pass_triangles"
 """The name of the method two_pass with a sheet mesh of four triangles."""
 
-METHODS = (*CORRECTIONS, TWO_PASS_TRIANGLES)
+METHODS = (*get_args(Correction), TWO_PASS_TRIANGLES)
 CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
@@ -64,6 +63,7 @@ def correction_family(reference: ReferenceFactory) -> Family:
         reference="rms error at the points that the eye sees on the simulated sheet",
         methods=METHODS,
         trials=partial(_trials, reference),
+        prepare=lambda scene, progress: deflection_cache.load_or_compute(scene, None, progress),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 

@@ -32,7 +32,6 @@ ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
 """A function that returns world points (n, 3), in m, of the reference sheet. Its arguments are the
 scene, the poses (4, 4) of the sheet's left and right edges, and the fingertip (3,), m."""
 
-METHODS = ("four_triangles", "reduced_order", "membrane")
 DEPTHS_M = (0.002, 0.01, 0.02, 0.035, 0.05)
 SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
@@ -50,8 +49,9 @@ def sheet_shape_family(reference: ReferenceFactory) -> Family:
         name="sheet-shape",
         unit="mm",
         reference="the simulated membrane, rms height",
-        methods=METHODS,
+        methods=("four_triangles", "reduced_order", "membrane"),
         trials=partial(_trials, reference),
+        prepare=lambda scene, progress: deflection_cache.load_or_compute(scene, None, progress),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
