@@ -19,7 +19,6 @@ from tests.scenes import load_cylinder
 SPACING_M = 0.005
 CYLINDER = {"shape": "cylinder", "radius_m": 0.02, "length_m": 0.05}
 STRIP = {"kind": "strip", "angle_rad": 1.57}
-LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +59,7 @@ def make_body(scene: Scene, spacing_m: float = SPACING_M) -> Body:
     """Make the soft body of a scene."""
     spec = make_soft_body_spec(scene, spacing_m)
     model = compute(spec, lambda *_: None)
-    soft = build_scene_body(
-        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, max_depth_m=MAX_DEPTH_M
-    )
+    soft = build_scene_body(scene, spec, model)
     return Body(scene, soft, model, build_mesh(spec.mesh))
 
 

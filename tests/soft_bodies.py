@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from flexsheet.messages.scene import Cylinder, StripSupport
+from flexsheet.nodes.fem_solver.contact import SkinResponse
 from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec
 from flexsheet.nodes.fem_solver.precompute import SoftBodySpec
+from flexsheet.nodes.fem_solver.table import Table
 
 
 def cylinder_spec(
@@ -33,6 +35,14 @@ def cylinder_spec(
         slab_depth_m=0.0,
     )
     return SoftBodySpec(mesh, poisson_ratio)
+
+
+def make_even_table(response: SkinResponse, newtons_per_metre: float) -> Table:
+    """Return a table to 20 mm in which each push has the same stiffness and moves no skin."""
+    depths, count = np.linspace(0.0, 0.02, 6), len(response.contact_nodes)
+    fields = np.zeros((count, 5, response.rest.size), dtype=np.float32)
+    force_n = newtons_per_metre * depths[:, None] * response.normals[:, None]
+    return Table(depths, fields, force_n, np.full(count, 0.02))
 
 
 class InlineExecutor(Executor):

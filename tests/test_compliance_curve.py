@@ -21,7 +21,7 @@ LINEAR = 0.006
 def soft() -> SceneBody:
     spec = make_soft_body_spec(SCENE, 0.0045)
     model = compute(spec, lambda done, total, need: None)
-    return build_scene_body(SCENE, spec, model, linear_depth_m=LINEAR, max_depth_m=0.010)
+    return build_scene_body(SCENE, spec, model)
 
 
 def test_the_depths_reach_from_the_touch_to_the_deepest_push() -> None:

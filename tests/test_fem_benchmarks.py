@@ -23,10 +23,9 @@ from flexsheet.nodes.fem_solver.benchmarks import (
 )
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
 from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
-from flexsheet.nodes.fem_solver.table import Table
 from flexsheet.nodes.methods import measure
 from tests.scenes import load_cylinder, load_values
-from tests.soft_bodies import InlineExecutor
+from tests.soft_bodies import InlineExecutor, make_even_table
 
 
 def small_scene() -> Scene:
@@ -66,8 +65,7 @@ def test_every_method_is_compared_with_a_finer_newton(
             "table": SoftBodyChoice(method="nonlinear_table", skin_spacing_m=0.005),
         },
         newton_m=(0.003,),
-        focused=(0.7,),
-        even_m=(0.005,),
+        ratios=(0.6, 0.7),
     )
     reports: list[tuple[int, int]] = []
     chart.prepare(lambda done, total: reports.append((done, total)))
@@ -100,15 +98,7 @@ def test_the_objects_curve_is_that_of_the_chosen_method(tmp_path: Path) -> None:
     spec = make_soft_body_spec(scene, chosen.skin_spacing_m)
     model = load_cached(precompute.response_cache(spec), tmp_path)
     assert model is not None
-    response, depths = model.response, np.linspace(0.0, 0.02, 6)
-    pascals = 1.0 / require_material(scene).young_modulus_pa
-    count = len(response.contact_nodes)
-    table = Table(
-        depths_m=depths,
-        fields=np.zeros((count, 5, response.rest.size), dtype=np.float32),
-        force_n=100.0 * pascals * depths[:, None] * response.normals[:, None],
-        reach_m=np.full(count, 0.02),
-    )
+    table = make_even_table(model.response, 100.0 / require_material(scene).young_modulus_pa)
     save_cached(make_table_cache(make_table_spec(scene, spec, coarse=True)), tmp_path, table)
     by_table = compute_front_curve(scene, tmp_path, lambda text: None)
     again = compute_front_curve(chooses_linear, tmp_path, lambda text: None)

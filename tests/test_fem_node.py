@@ -21,11 +21,11 @@ from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
 from flexsheet.nodes.fem_solver.node import FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
-from flexsheet.nodes.fem_solver.table import Table
 from tests.fingertips import fingertip as even_fingertip
 from tests.node_harness import NodeHarness
 from tests.note_text import note_text
 from tests.scenes import load_values
+from tests.soft_bodies import make_even_table
 
 SPACING_M = 0.007
 
@@ -248,14 +248,7 @@ async def test_a_cached_table_is_used(
     spec = make_soft_body_spec(scene(), SPACING_M)
     model = precompute.load_or_compute(spec, Path(cache), lambda *_: None)
     save_cached(precompute.response_cache(spec), tmp_path, model)
-    response, depths = model.response, np.linspace(0.0, 0.02, 6)
-    count = len(response.contact_nodes)
-    table = Table(
-        depths_m=depths,
-        fields=np.zeros((count, 5, response.rest.size), dtype=np.float32),
-        force_n=0.01 * depths[:, None] * response.normals[:, None],
-        reach_m=np.full(count, 0.02),
-    )
+    table = make_even_table(model.response, 0.01)
     table_spec = make_table_spec(scene(), spec, coarse=coarse)
     save_cached(make_table_cache(table_spec), tmp_path, table)
     monkeypatch.setattr(precompute, "compute", pytest.fail)

@@ -31,6 +31,7 @@ from flexsheet.nodes.fem_solver.snapshots import (
     solve_snapshot,
 )
 from flexsheet.nodes.fem_solver.table import compute_force_factors, find_mirror_images
+from flexsheet.nodes.renderer import deflection_cache
 from tests.soft_bodies import cylinder_spec
 
 Floats = NDArray[np.float64]
@@ -139,6 +140,19 @@ def test_the_shipped_pushes_of_the_demo_are_current() -> None:
     assert first.rest == pytest.approx(solved.rest, abs=1e-7)
     assert first.moved == pytest.approx(solved.moved, abs=2e-5)
     assert (first.faces == solved.faces).all()
+
+
+@pytest.mark.parametrize("file", sorted((LAUNCH / "scenes").glob("*.yaml")), ids=lambda f: f.stem)
+def test_the_package_contains_what_a_first_start_needs(file: Path) -> None:
+    """If this test fails, run `python -m benchmarks.ship_tables`."""
+    scene = load_scene(file)
+    if scene.methods.sheet_shape == "reduced_order":
+        for _, stored in deflection_cache.list_stored(scene):
+            assert deflection_cache.shapes_cache(stored).path(deflection_cache.FOLDER).exists()
+    choice = scene.methods.soft_body
+    if scene.object.material is not None and choice.method == "nonlinear_table":
+        spec = make_soft_body_spec(scene, choice.skin_spacing_m)
+        assert shipped_path(make_table_cache(make_table_spec(scene, spec, coarse=True))).exists()
 
 
 def test_forces_are_corrected_to_those_of_an_infinitely_fine_mesh() -> None:

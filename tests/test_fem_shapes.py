@@ -72,7 +72,7 @@ def soft(request: pytest.FixtureRequest) -> SceneBody:
     expected, table = estimate_budget(spec), model.response.influence
     # said beforehand, and not far off
     assert 0.5 * len(table) < expected.loads < 4.0 * len(table)
-    return build_scene_body(chosen, spec, model, linear_depth_m=0.006, max_depth_m=0.010)
+    return build_scene_body(chosen, spec, model)
 
 
 def test_the_front_of_a_tilted_plane_is_not_its_edge() -> None:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from flexsheet.messages.methods import SoftBodyChoice
-from flexsheet.messages.scene import Cylinder, Scene, require_material
+from flexsheet.messages.scene import Scene, require_material
 from flexsheet.nodes.arrays import Floats, Singles
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import snapshots
@@ -28,7 +28,6 @@ from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.newton import EquilibriumState, NeoHookeanBody
 from flexsheet.nodes.fem_solver.reference import (
     ReferenceSolution,
-    make_even_job,
     make_focused_job,
     solve_cached_jobs,
 )
@@ -46,10 +45,9 @@ TABLES = {
 }
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
-FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
-"""The distances between the skin nodes of the reference meshes of two kinds. The finest mesh of
-each kind comes first. Focused meshes are fine only near the finger, and their spacing is in finger
-radii. Even meshes have the same spacing everywhere, in metres."""
+REFERENCE_RATIOS = (0.32, 0.64)
+"""The distances between the skin nodes of the reference meshes near the finger, in finger radii.
+The finest mesh comes first."""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
@@ -86,9 +84,7 @@ class SoftBodyBenchmark:
     choices: methods with the distances between skin nodes, by the names in the chart. A table that
         is not cached is replaced by the coarse table.
     newton_m: depths at which the time of full Newton solutions is measured.
-    focused: distances between skin nodes of the reference meshes that are fine only near the
-        finger, in finger radii.
-    even_m: distances between skin nodes (m) of the reference meshes with uniform spacing.
+    ratios: distances between skin nodes of the reference meshes near the finger, in finger radii.
     """
 
     scene: Scene
@@ -96,8 +92,7 @@ class SoftBodyBenchmark:
     depths_m: Sequence[float]
     choices: Mapping[str, SoftBodyChoice]
     newton_m: Sequence[float]
-    focused: Sequence[float]
-    even_m: Sequence[float]
+    ratios: Sequence[float]
 
     def body(self, choice: SoftBodyChoice) -> SceneBody:
         """Return the soft body with a method, from the cache."""
@@ -117,17 +112,9 @@ class SoftBodyBenchmark:
         """Return the name and the inputs of each reference solution, most accurate first."""
         body, sample = self.coarsest(), self.sample()
         jobs = []
-        has_focused = snapshots.has_focused_meshes(body.spec.mesh)
-        # Solutions on even meshes of a slab take ten minutes, so only focused ones are used there.
-        has_even = not has_focused or isinstance(body.spec.mesh.geometry, Cylinder)
-        for focused, even in zip(self.focused, self.even_m, strict=True):
-            if has_focused:
-                job = make_focused_job(body, self.scene, sample, focused, self.depths_m)
-                spacing = 1e3 * focused * self.scene.finger.radius_m
-                jobs.append((f"{spacing:.2g} mm about the finger", job))
-            if has_even:
-                job = make_even_job(body, self.scene, sample, even, self.depths_m)
-                jobs.append((f"{1e3 * even:g} mm everywhere", job))
+        for ratio in self.ratios:
+            job = make_focused_job(body, self.scene, sample, ratio, self.depths_m)
+            jobs.append((f"{1e3 * ratio * self.scene.finger.radius_m:.2g} mm", job))
         return jobs
 
     def prepare(self, on_progress: Progress) -> None:
@@ -290,8 +277,7 @@ def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
         depths_m=clip_range(max_depth_m, DEPTHS_M),
         choices=LINEAR | TABLES,
         newton_m=[depth for depth in NEWTON_DEPTHS_M if depth <= max_depth_m],
-        focused=FOCUSED_RATIOS,
-        even_m=EVEN_SPACINGS_M,
+        ratios=REFERENCE_RATIOS,
     )
 
 

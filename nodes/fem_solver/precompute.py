@@ -29,12 +29,11 @@ from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.models.shapes import make_shape
 
 if TYPE_CHECKING:
-    from flexsheet.nodes.fem_solver.multifrontal import Factors, NestedDissection
+    from flexsheet.nodes.fem_solver.multifrontal import Factors
 
 VERSION = 4
 """The version of the computation. Increase it when results for the same specification change."""
 CHUNK_LOADS = 128
-ELEMENT_BYTES = 30 * 30 * 8
 MESH_STEPS, FACTOR_STEPS = 1, 4
 """The approximate durations of two steps: meshing, and factoring the stiffness matrix. They are
 used for progress reports, in units of the time that one unit force needs."""
@@ -103,16 +102,6 @@ class ResponseBudget:
         )
 
 
-def compute_budget(mesh: SolidMesh, order: NestedDissection) -> ResponseBudget:
-    """Return the resources that a precomputation with a given mesh and elimination order needs."""
-    factors = sum(len(f.pivots) * (len(f.pivots) + len(f.boundary)) for f in order.fronts) * 8
-    stiffness = len(mesh.elements) * ELEMENT_BYTES * 3
-    chunk = 3 * len(mesh.nodes) * CHUNK_LOADS * 8 * 4
-    loads = len(mesh.contact_nodes)
-    table = loads * (len(mesh.skin) * 3 * 4 + loads * 8)
-    return ResponseBudget(len(mesh.skin), loads, factors + stiffness + chunk, table)
-
-
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
     """Estimate the resources of a precomputation within a factor of two, without meshing.
 
@@ -148,9 +137,7 @@ def compute(spec: SoftBodySpec, progress: Progress) -> SoftBodyModel:
     need.require_memory(spec.mesh.skin_spacing_m)
     mesh = build_mesh(spec.mesh)
     order = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed)
-    need = compute_budget(mesh, order)
-    need.require_memory(spec.mesh.skin_spacing_m)
-    done, total = 0, need.loads + MESH_STEPS + FACTOR_STEPS
+    done, total = 0, len(mesh.contact_nodes) + MESH_STEPS + FACTOR_STEPS
 
     def advance(count: int) -> None:
         nonlocal done

@@ -86,24 +86,6 @@ def make_focused_job(
     return replace(job, depths_m=tuple(depths_m))
 
 
-def make_even_job(
-    body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
-) -> SnapshotJob:
-    """Return the inputs of a Newton solution for pushes at a point, on a mesh of uniform spacing.
-
-    spacing_m: distance between skin nodes.
-    depths_m: push depths.
-    """
-    mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
-    return snapshots.make_job_on_mesh(
-        mesh,
-        sample,
-        poisson_ratio=body.spec.poisson_ratio,
-        finger_radius_m=scene.finger.radius_m,
-        depths_m=tuple(depths_m),
-    )
-
-
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:

@@ -75,12 +75,13 @@ def cylinder_mesh(
     if not 0.0 < half_support < np.pi:
         raise ValueError(
             f"object.support.angle_rad: {support_angle_rad:g} must be between 0 and 2 pi; change "
-            "this angle"
+            "this angle, or working_range.tilt_rad if the support is not a strip"
         )
     if touch_angle_rad <= 0.0 or touch_angle_rad > np.pi - half_support + 1e-9:
         raise ValueError(
             f"touch_angle_rad: {touch_angle_rad:g} must be positive and at most "
-            f"{np.pi - half_support:g}, where the support begins; reduce object.support.angle_rad"
+            f"{np.pi - half_support:g}, where the support begins; reduce working_range.tilt_rad, "
+            "from which this angle results, or object.support.angle_rad"
         )
     if not 0.0 < skin_spacing_m <= 0.25 * min(radius_m, length_m):
         raise ValueError(
