@@ -36,7 +36,7 @@ from tests.waiting import DEADLINE_S
 
 MS = 1_000_000
 PERIOD_NS = round(1e9 / 60)
-PAIR = {"kind": "opencv", "left": 0, "right": 2}
+PAIR = {"kind": "live", "left": 0, "right": 2}
 
 
 @pytest.fixture(scope="module")

@@ -124,7 +124,7 @@ class Chain:
         for node, transport in zip(self.nodes, self.transports, strict=True):
             transport.open_outputs(node)
             await node.setup()
-            transport.open_inputs(node)
+            await transport.open_inputs(node)
         for recorder in self.recorders:
             recorder.start()
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from flexsheet.launch.commands import output
-from flexsheet.launch.health import doctor
 
 
 def test_progress_is_printed_in_lines_where_stderr_is_no_terminal(
@@ -34,12 +32,3 @@ def test_a_progress_bar_prints_nothing_in_a_dumb_terminal_if_it_is_short(
     with output.progress_bar("detecting the board") as progress:
         progress(1, 2)
     assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(("count", "words"), [(1, "1 graph is running"), (2, "2 graphs are")])
-def test_the_number_of_graphs_agrees_with_the_verb(
-    count: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(doctor, "root", lambda: tmp_path)
-    monkeypatch.setattr(doctor, "list_live_runs", lambda: [None] * count)
-    assert words in doctor.check_sockets().what

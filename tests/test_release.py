@@ -30,7 +30,6 @@ PYTHONS = [
     for line in PROJECT["classifiers"]
     if (found := re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line))
 ]
-CATEGORIES = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
 
 READ_ALL = """
 import json
@@ -165,19 +164,3 @@ def test_versions_are_semantic_and_equal() -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+", VERSION)
     assert f"\nversion: {VERSION}\n" in (ROOT / "CITATION.cff").read_text()
     assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
-
-
-def test_the_changelog_has_the_format_of_keep_a_changelog() -> None:
-    text = (ROOT / "CHANGELOG.md").read_text()
-    first, *released = re.findall(r"^## (.*)$", text, re.MULTILINE)
-    assert first == "[Unreleased]"
-    found = [re.fullmatch(r"\[(\d+)\.(\d+)\.(\d+)\] - \d{4}-\d\d-\d\d", one) for one in released]
-    assert None not in found
-    versions = [tuple(map(int, one.groups())) for one in found if one]
-    assert versions == sorted(set(versions), reverse=True)
-    for section in re.split(r"^## ", text, flags=re.MULTILINE)[1:]:
-        categories = re.findall(r"^### (.*)$", section, re.MULTILINE)
-        assert set(categories) <= CATEGORIES
-        assert len(categories) == len(set(categories)), section[:40]
-    entries = re.findall(r"^- .*$", text, re.MULTILINE)
-    assert len(entries) == len(set(entries))

@@ -69,14 +69,6 @@ def test_a_recorder_of_another_class_is_one(tmp_path: Path) -> None:
     assert find_recording_folder(plan.nodes_on(None)) == tmp_path
 
 
-def test_plans_of_old_bags_have_the_roles_of_their_types(tmp_path: Path) -> None:
-    plan = plan_with(tmp_path, {"type": f"{__name__}:OwnBridge"}).model_dump(mode="json")
-    (node,) = plan["nodes"].values()
-    del node["role"]
-    node["type"] = "arm_bridge"
-    assert ResolvedGraph.model_validate(plan).nodes["bridge"].role is NodeRole.ARM_BRIDGE
-
-
 def test_the_shipped_nodes_have_their_roles() -> None:
     roles = {name: find_role(node_class(name)) for name in NODES}
     assert {name: role for name, role in roles.items() if role is not None} == {

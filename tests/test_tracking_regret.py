@@ -17,7 +17,7 @@ from benchmarks.hand_motion import (
 from benchmarks.tracking_regret import (
     HORIZONS_S,
     RECORDING,
-    compare_methods,
+    compare_predictions,
     draw_hands,
     measure_all,
     read_recording,
@@ -53,10 +53,10 @@ def test_strokes_are_as_fast_as_a_hand_that_explores() -> None:
     assert np.abs(strokes).max() < 20.0
 
 
-def test_no_method_beats_the_predictor_that_knows_the_spectrum_by_much() -> None:
+def test_the_tracking_does_not_beat_the_predictor_that_knows_the_spectrum_by_much() -> None:
     """Hands that are Gaussian: what is left to win is chance and the limited bound's window."""
     hand = next(one for one in draw_hands(SEED) if one.motion == "2 Hz")
-    for regret in compare_methods(hand, 0.01, 30, SEED, {}):
+    for regret in compare_predictions(hand, 0.01, 30, SEED, {}):
         assert regret.wiener_mm is not None
         assert min(regret.error_mm.values()) > 0.85 * regret.wiener_mm
 
@@ -65,16 +65,16 @@ def test_no_method_beats_the_predictor_that_knows_the_spectrum_by_much() -> None
     ("motion", "band"),
     long_except([("1 Hz", "5-7 Hz"), ("strokes", "8-12 Hz")], ("strokes", "8-12 Hz")),
 )
-def test_the_default_is_near_the_best_method_and_the_least_error(motion: str, band: str) -> None:
+def test_the_tracking_is_near_the_best_model_and_the_least_error(motion: str, band: str) -> None:
     hand = next(
         one
         for one in draw_hands(SEED)
         if (one.motion, one.band, one.tremor_mm) == (motion, band, 0.05)
     )
     step_s: dict[str, list[float]] = {}
-    for regret in compare_methods(hand, 0.01, 60, SEED, step_s):
+    for regret in compare_predictions(hand, 0.01, 60, SEED, step_s):
         assert regret.wiener_mm is not None
-        assert regret.error_mm["adaptive"] < 1.1 * min(regret.error_mm.values())
+        assert regret.error_mm["adaptive"] < 1.1 * regret.bank_mm
         assert regret.error_mm["adaptive"] < 1.4 * regret.wiener_mm
     assert set(step_s) == set(regret.error_mm)
 
@@ -87,13 +87,13 @@ def test_a_file_without_the_columns_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not RECORDING.is_file(), reason="../shared/data is not here")
-def test_a_recorded_finger_is_predicted_as_well_as_by_any_method() -> None:
+def test_a_recorded_finger_is_predicted_as_well_as_by_the_best_model() -> None:
     hand = read_recording(RECORDING)
-    regrets = list(compare_methods(hand, 0.01, 60, SEED, {}))
+    regrets = list(compare_predictions(hand, 0.01, 60, SEED, {}))
     assert [regret.horizon_ms for regret in regrets] == [round(1e3 * h) for h in HORIZONS_S]
     for regret in regrets:
         assert regret.wiener_mm is None
-        assert regret.error_mm["adaptive"] < 1.1 * min(regret.error_mm.values())
+        assert regret.error_mm["adaptive"] < 1.1 * regret.bank_mm
 
 
 def test_the_result_names_machine_seeds_and_every_case(monkeypatch: pytest.MonkeyPatch) -> None:
