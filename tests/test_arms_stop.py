@@ -164,8 +164,8 @@ async def test_a_bridge_without_its_arm_states_the_reason() -> None:
     plan = load_graph(ROOT / "launch" / "demo.yaml")
     arms = arms_command._Arms(plan, Run("unused", Path("unused")))
     note = "waiting for the arm: no connection to 127.0.0.1:5099"
-    arms._on_message(status_of("arm_left_bridge", notes=(Note(detail=note),)), None)
-    arms._on_message(status_of("planner", notes=(Note(detail="follows the finger"),)), None)
+    arms.add_status(status_of("arm_left_bridge", notes=(Note(detail=note),)))
+    arms.add_status(status_of("planner", notes=(Note(detail="follows the finger"),)))
     rows = arms_command.describe_arms(arms.states, arms.notes)
     assert [row["reason"] for row in rows] == [note, "no message from the bridge"]
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands.graph import (
     NoGraphError,
     choose_run,
+    receive_until,
     run_interruptible,
     running_graph,
 )
@@ -37,17 +40,13 @@ if TYPE_CHECKING:
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
     from flexsheet.launch.running.stopping import StopAttempt
-    from flexsheet.launch.running.tools import GraphWriter
     from flexsheet.messages.base import Message
-    from flexsheet.messages.bus import Subscriber
-    from flexsheet.messages.types import ArmState, EStop
+    from flexsheet.messages.types import ArmState, Status
 
 app = make_app("Enable, disable, stop and reset the arms of a running graph.")
 
 SIDES = ("left", "right")
-TOPICS = ("arm_left", "arm_right", "status")
 CONFIRMATION_TIMEOUT_S = 3.0
-MAX_STATE_AGE_S, POLL_PERIOD_S = 0.5, 0.02
 
 ReasonOption = Annotated[
     str, typer.Option("--reason", help="Reason for the command; it is shown and logged.")
@@ -62,10 +61,7 @@ def enable(run: ChangedRunOption = None, as_json: JsonOption = False) -> None:
     """
     from flexsheet.messages.types import Arming
 
-    def done(arms: dict[str, ArmState]) -> bool:
-        return len(arms) == 2 and all(arm.ready for arm in arms.values())
-
-    raise typer.Exit(_command(choose_run(run), ("arming", Arming(ready=True)), done, as_json))
+    raise typer.Exit(_command(run, "arming", Arming(ready=True), lambda arm: arm.ready, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms disable --reason 'end of the session'"))
@@ -75,11 +71,8 @@ def disable(
     """Stop both arms and slacken the sheet until you run `flexsheet arms enable`."""
     from flexsheet.messages.types import Arming
 
-    def done(arms: dict[str, ArmState]) -> bool:
-        return len(arms) == 2 and not any(arm.ready for arm in arms.values())
-
-    command = ("arming", Arming(ready=False, reason=reason))
-    raise typer.Exit(_command(choose_run(run), command, done, as_json))
+    message = Arming(ready=False, reason=reason)
+    raise typer.Exit(_command(run, "arming", message, lambda arm: not arm.ready, as_json))
 
 
 @app.command(epilog=examples("flexsheet arms stop"))
@@ -109,25 +102,24 @@ def stop(
 
 @dataclass(frozen=True, slots=True)
 class _StopResult:
-    """The attempts to stop the arms of one run, and the states of its arms."""
+    """The attempts to stop the arms of the run in a directory, and the states of its arms."""
 
-    run: Run
+    run: Path
     attempts: list[StopAttempt]
     arms: dict[str, ArmState]
-    problems: list[str]
 
     @property
     def shown(self) -> bool:
         """Return whether both arms report the stop."""
-        return _are_stopped(self.arms)
+        return len(self.arms) == 2 and all(map(_is_stopped, self.arms.values()))
 
     @property
     def confirmed(self) -> bool:
         return self.shown or any(one.worked for one in self.attempts)
 
 
-def _are_stopped(arms: dict[str, ArmState]) -> bool:
-    return len(arms) == 2 and all(arm.mode == "estop" for arm in arms.values())
+def _is_stopped(arm: ArmState) -> bool:
+    return arm.mode == "estop"
 
 
 async def _confirm_stops(
@@ -157,9 +149,7 @@ async def _confirm_stops(
     )
     _show_stop(results, as_json)
     for result in results:
-        where = "" if len(results) == 1 else f" of {result.run.directory}"
-        for text in result.problems:
-            words.print(text)
+        where = "" if len(results) == 1 else f" of {result.run}"
         if not result.shown:
             silent = [side for side, state in result.arms.items() if state.mode != "estop"]
             silent += [side for side in SIDES if side not in result.arms]
@@ -183,24 +173,36 @@ async def _confirm_stop(
     """
     from pydantic import ValidationError
 
-    from flexsheet.launch.running.runs import Run
-    from flexsheet.launch.running.stopping import StopPath
+    from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
+    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
+    from flexsheet.messages.bus import BusError
     from flexsheet.messages.types import EStop
 
     try:
         plan, run = running_graph(run_directory)
     except ValidationError:
         assert run_directory is not None
-        text = (
+        words.print(
             f"another version of flexsheet runs {run_directory}; check its arms with that version"
         )
-        return _StopResult(Run(run_directory.name, run_directory), attempts, {}, [text])
-    latched = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
-    async with _Arms(plan, run) as arms:
-        if not latched:
-            attempts = [*attempts, await arms.publish_stop(EStop(engaged=True, reason=reason))]
-        await arms.wait_for(_are_stopped)
-    return _StopResult(run, attempts, arms.states, arms.problems)
+        return _StopResult(run_directory, attempts, {})
+    arms = _Arms(plan, run)
+    with ExitStack() as stack:
+        if not any(one.path is StopPath.LAUNCHER and one.worked for one in attempts):
+            begun_s, outcome = time.monotonic(), StopOutcome.PUBLISHED
+            try:
+                writer = stack.enter_context(closing(GraphWriter(plan, run, ["estop"])))
+                writer.publish("estop", EStop(engaged=True, reason=reason))
+            except BusError:
+                outcome = StopOutcome.REFUSED
+            after_ms = 1e3 * (time.monotonic() - begun_s)
+            attempt = StopAttempt(run.directory, StopPath.TOPIC, "estop", outcome, after_ms)
+            attempts = [*attempts, attempt]
+            if outcome is StopOutcome.PUBLISHED:
+                # The topic is latched: launchers and nodes that connect now also receive the stop.
+                await asyncio.sleep(READER_RECONNECT_S)
+        await arms.wait_for(_is_stopped)
+    return _StopResult(run.directory, attempts, arms.states)
 
 
 @app.command(epilog=examples("flexsheet arms reset --reason 'inspected, all clear'"))
@@ -228,10 +230,8 @@ def reset(
             f"or set hosts.{host}.may_reset_estop in {plan.launch_file}"
         )
 
-    def done(arms: dict[str, ArmState]) -> bool:
-        return len(arms) == 2 and not any(arm.faults for arm in arms.values())
-
-    code = _command(run, ("estop", EStop(engaged=False, reason=reason)), done, as_json)
+    message = EStop(engaged=False, reason=reason)
+    code = _command(run, "estop", message, lambda arm: not arm.faults, as_json)
     if code == 0:
         words.print(_describe_reset(plan))
     raise typer.Exit(code)
@@ -259,117 +259,68 @@ def _describe_reset(plan: ResolvedGraph) -> str:
 
 
 class _Arms:
-    """An asynchronous context manager that receives arm states and publishes commands."""
+    """The newest states of the arms of a graph, and the notes of their nodes, by side."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
-        self._loop = asyncio.get_running_loop()
-        self._received_s: dict[str, float] = {}
-        self._subscribers: list[Subscriber] = []
-        self._writer: GraphWriter | None = None
         self.states: dict[str, ArmState] = {}
         self.notes: dict[str, str] = {}
-        self.problems: list[str] = []
 
-    async def __aenter__(self) -> Self:
-        from flexsheet.launch.running.tools import make_subscriber
+    def add_state(self, state: ArmState) -> None:
+        self.states[state.side] = state
 
-        for topic in TOPICS:
-            subscriber = make_subscriber(
-                topic, self._plan, self._run, self._on_message, on_problem=self.problems.append
-            )
-            self._subscribers.append(subscriber)
-            subscriber.start()
-        return self
+    def add_status(self, status: Status) -> None:
+        node = self._plan.nodes.get(status.node)
+        if node is not None and node.arm_side is not None:
+            self.notes[node.arm_side] = status.last_error or status.note_text
 
-    async def __aexit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.close()
-        for subscriber in self._subscribers:
-            subscriber.close()
+    async def wait_for(self, done: Callable[[ArmState], bool]) -> bool:
+        """Receive states until `done` returns True for both arms; return False on a timeout."""
+        handlers = {
+            "arm_left": self.add_state,
+            "arm_right": self.add_state,
+            "status": self.add_status,
+        }
 
-    def _on_message(self, message: Any, _: Any) -> None:
-        from flexsheet.messages.types import Status
+        def both_done() -> bool:
+            return len(self.states) == 2 and all(map(done, self.states.values()))
 
-        if isinstance(message, Status):
-            node = self._plan.nodes.get(message.node)
-            if node is not None and node.arm_side is not None:
-                self.notes[node.arm_side] = message.last_error or message.note_text
-        else:
-            self.states[message.side] = message
-            self._received_s[message.side] = self._loop.time()
-
-    async def publish(self, topic: str, message: Message) -> None:
-        """Wait until subscribers have connected, then publish a message once."""
-        from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
-
-        self._writer = GraphWriter(self._plan, self._run, [topic])
-        await asyncio.sleep(READER_RECONNECT_S)
-        self._writer.publish(topic, message)
-
-    async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Publish an e-stop at once, and return the outcome and the duration of the attempt.
-
-        The topic `estop` is latched, so subscribers that connect later also receive the e-stop.
-        """
-        from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
-        from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
-        from flexsheet.messages.bus import BusError
-
-        begun_s, outcome = self._loop.time(), StopOutcome.PUBLISHED
-        try:
-            self._writer = GraphWriter(self._plan, self._run, ["estop"])
-            self._writer.publish("estop", estop)
-            after_ms = 1e3 * (self._loop.time() - begun_s)
-            # Wait until a launcher, which stores the e-stop, has had time to connect.
-            await asyncio.sleep(READER_RECONNECT_S)
-        except BusError:
-            outcome, after_ms = StopOutcome.REFUSED, 1e3 * (self._loop.time() - begun_s)
-        return StopAttempt(self._run.directory, StopPath.TOPIC, "estop", outcome, after_ms)
-
-    async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Wait until `done` returns True for the recent states of the arms.
-
-        Returns False if this does not happen before the timeout.
-        """
-        for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
-            now_s = self._loop.time()
-            ages_s = {side: now_s - received_s for side, received_s in self._received_s.items()}
-            recent = {s: arm for s, arm in self.states.items() if ages_s[s] < MAX_STATE_AGE_S}
-            if done(recent):
-                return True
-            await asyncio.sleep(POLL_PERIOD_S)
-        return False
+        timeout_s = CONFIRMATION_TIMEOUT_S
+        return await receive_until(self._plan, self._run, handlers, both_done, timeout_s)
 
 
 def _command(
     run_directory: Path | None,
-    command: tuple[str, Message],
-    done: Callable[[dict[str, ArmState]], bool],
+    topic: str,
+    message: Message,
+    done: Callable[[ArmState], bool],
     as_json: bool,
 ) -> int:
     """Publish a command to both arms, wait for its effect, and print the states of the arms.
 
     Returns the exit code.
 
-    command: topic and message to publish.
-    done: function that receives the arm states, and returns True when the command has had its
+    done: function that receives the state of an arm, and returns True when the command has had its
         effect.
+
+    Raises SeveralGraphsError if `run_directory` is None and several graphs are running.
     """
-    plan, run = running_graph(run_directory)
+    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
+
+    plan, run = running_graph(choose_run(run_directory))
 
     async def work() -> int:
-        async with _Arms(plan, run) as arms:
-            await arms.publish(*command)
+        arms = _Arms(plan, run)
+        with closing(GraphWriter(plan, run, [topic])) as writer:
+            await asyncio.sleep(READER_RECONNECT_S)
+            writer.publish(topic, message)
             confirmed = await arms.wait_for(done)
         print_rows(describe_arms(arms.states, arms.notes), as_json=as_json)
-        for text in arms.problems:
-            words.print(text)
         if not confirmed:
             words.print(
                 "[red]not confirmed[/]: see the reasons above, and `flexsheet status`", markup=True
             )
-            if any(state.mode == "estop" for state in arms.states.values()):
+            if any(map(_is_stopped, arms.states.values())):
                 words.print("an e-stop is engaged; to release it: flexsheet arms reset")
         return 0 if confirmed else FAILED
 
@@ -402,7 +353,7 @@ def _show_stop(results: list[_StopResult], as_json: bool) -> None:
     """
 
     def name_run(result: _StopResult) -> dict[str, Any]:
-        return {} if len(results) == 1 else {"run": str(result.run.directory)}
+        return {} if len(results) == 1 else {"run": str(result.run)}
 
     paths = [
         {
