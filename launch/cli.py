@@ -35,7 +35,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "bag": ("bag",),
     "ros2-bridge": ("ros2_bridge",),
     "arms": ("arms",),
-    "experiment": ("experiment", "experiment_sweeps"),
+    "experiment": ("experiment",),
     "apparatus": ("apparatus",),
     "scene": ("scene",),
     "demo": ("demo",),

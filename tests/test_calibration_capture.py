@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rich.console import Console
 from ruamel.yaml import YAML
 
 from flexsheet.launch.calibration.bundle import pose_vector
@@ -34,7 +33,7 @@ from flexsheet.launch.calibration.corners import (
     match_views,
 )
 from flexsheet.launch.calibration.stereo import calibrate_stereo
-from flexsheet.launch.commands.capture import coverage_view, write_pairs
+from flexsheet.launch.commands.capture import write_pairs
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.calibration import Board, StereoCalibration
@@ -231,20 +230,6 @@ def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
         assert picture[0].shape == (camera.height_px, camera.width_px)
     top_left = Bin(BinGroup.RIGHT_CELL, cell=(0, 0))
     assert describe_requirement(top_left) == "at the top left of the right image"
-
-
-def test_coverage_image_shows_missing_parts(camera: StereoCamera) -> None:
-    capture = watching(camera, pairs=20, still_images=1)
-    (picture,) = shown(CHESSBOARD, camera, 1, seed=6)
-    assert capture.add_pair(*picture).accepted
-    console = Console(width=160, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
-    console.print(coverage_view(capture, "tilt it"))
-    drawn = console.export_text()
-    assert "1/20" in drawn
-    assert "1/2" in drawn
-    assert "left side back" in drawn
-    assert "tilt it" in drawn
-    console.file.close()
 
 
 def test_ctrl_c_keeps_the_images_taken(camera: StereoCamera, tmp_path: Path) -> None:

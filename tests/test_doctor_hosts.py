@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from flexsheet.launch.commands.doctor_hosts import check_hosts, find_host
+from flexsheet.launch.commands.doctor import check_hosts, find_host
 from flexsheet.launch.commands.graph import describe_launch
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.health import probe as probe_module

@@ -145,9 +145,6 @@ def play(
             metavar="SECONDS", help="Time in the bag at which playback starts, s.", min=0.0
         ),
     ] = 0.0,
-    loop: Annotated[
-        bool, typer.Option("-l", "--loop", help="Repeat playback until Ctrl-C.")
-    ] = False,
     topics: options.TopicsOption = None,
     launch: Annotated[
         Path | None,
@@ -164,18 +161,38 @@ def play(
     Only topics that the launch file lists under `external_topics` are played.
     """
 
+    from flexsheet.launch.bags.player import NEVER_PLAYED, select_topics
+    from flexsheet.launch.bags.player import play as play_bag
+    from flexsheet.messages.bag import BagReader
+
     async def play_into(plan: ResolvedGraph, found: Run) -> int:
-        return await _play(
-            bag,
-            plan,
-            found,
-            started=launch is not None,
-            topics=topics,
-            rate=rate,
-            start_s=start,
-            loop=loop,
+        selection = select_topics(BagReader(bag).topics, plan, tuple(topics or ()))
+        for name, why in selection.left_out.items():
+            words.print(f"not played: {name}: {why}")
+        if not selection.topics:
+            raise CommandError(
+                f"{bag}: contains no topic that can be played into {plan.launch_file}; play it "
+                "into a graph without the nodes that write these topics: "
+                f"flexsheet bag play {bag} --launch replay",
+                FAILED,
+            )
+        refused = selection.left_out.keys() - NEVER_PLAYED.keys()
+        if launch is None and any(map(plan.writers.get, refused)):
+            words.print(
+                "to play topics that a node writes, use a launch file without this node that "
+                "lists them under external_topics, such as --launch replay"
+            )
+        with progress_bar(f"playing {bag.name}") as progress:
+            sent = await play_bag(
+                bag, plan, found, topics=selection.topics, rate=rate, start_s=start,
+                progress=progress,
+            )  # fmt: skip
+        print_outcome(
+            {"bag": str(bag), "messages": sent, "topics": list(selection.topics)},
+            f"played {sent} messages on {', '.join(selection.topics)}",
             as_json=as_json,
         )
+        return 0
 
     async def start_and_play(plan: ResolvedGraph) -> int:
         from flexsheet.launch.running.supervisor import RunningGraph
@@ -494,58 +511,3 @@ async def _show_remaining(label: str, duration_s: float | None) -> None:
         while True:
             progress(min(loop.time() - begun_s, duration_s), duration_s)
             await asyncio.sleep(PROGRESS_PERIOD_S)
-
-
-async def _play(
-    bag: Path,
-    plan: ResolvedGraph,
-    run: Run,
-    *,
-    started: bool,
-    topics: list[str] | None,
-    rate: float,
-    start_s: float,
-    loop: bool,
-    as_json: bool,
-) -> int:
-    """Publish the messages of a bag to a running graph; always return 0, the exit code.
-
-    started: whether this command has started the graph.
-    rate: playback speed relative to the recording.
-    start_s: time in the bag at which playback starts.
-    """
-    from flexsheet.launch.bags.player import NEVER_PLAYED, select_topics
-    from flexsheet.launch.bags.player import play as play_bag
-    from flexsheet.messages.bag import BagReader
-
-    selection = select_topics(BagReader(bag).topics, plan, tuple(topics or ()))
-    for name, why in selection.left_out.items():
-        words.print(f"not played: {name}: {why}")
-    if not selection.topics:
-        raise CommandError(
-            f"{bag}: contains no topic that can be played into {plan.launch_file}; play it into a "
-            "graph without the nodes that write these topics: "
-            f"flexsheet bag play {bag} --launch replay",
-            FAILED,
-        )
-    refused = selection.left_out.keys() - NEVER_PLAYED.keys()
-    if not started and any(map(plan.writers.get, refused)):
-        words.print(
-            "to play topics that a node writes, use a launch file without this node that lists "
-            "them under external_topics, such as --launch replay"
-        )
-    sent = 0
-    while True:
-        with progress_bar(f"playing {bag.name}") as progress:
-            sent += await play_bag(
-                bag, plan, run, topics=selection.topics, rate=rate, start_s=start_s,
-                progress=progress,
-            )  # fmt: skip
-        if not loop:
-            break
-    print_outcome(
-        {"bag": str(bag), "messages": sent, "topics": list(selection.topics)},
-        f"played {sent} messages on {', '.join(selection.topics)}",
-        as_json=as_json,
-    )
-    return 0

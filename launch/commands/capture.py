@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +15,11 @@ from flexsheet.nodes.camera.image_pair import encode_png
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-    from rich.console import RenderableType
 
     from flexsheet.launch.calibration.capture import Capture
     from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.calibration import Board
     from flexsheet.messages.scene import Scene
-    from flexsheet.nodes.camera.sources import AnySource
 
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
@@ -40,6 +38,8 @@ def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
     from ruamel.yaml.error import YAMLError
 
     from flexsheet.launch.plans.documents import parse_value
+    from flexsheet.nodes.camera.devices import open_reader
+    from flexsheet.nodes.camera.image_pair import check_size
     from flexsheet.nodes.camera.sources import AnySource
 
     try:
@@ -57,13 +57,6 @@ def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
         raise CommandError(
             "--device-source twin: the simulator of a graph shows no board; use --twin SCENE"
         )
-    return _read_views(described, source, scene)
-
-
-def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
-    from flexsheet.nodes.camera.devices import open_reader
-    from flexsheet.nodes.camera.image_pair import check_size
-
     with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
         for warning in reader.warnings:
             words.print(f"camera: {warning}")
@@ -100,7 +93,7 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
         raise CommandError(f"--pictures {folder}: the folder exists; name a new folder")
     accepted = 0
     try:
-        with _show_coverage(capture) as show:
+        with words.status("waiting for images") as status:
             for left, right in views:
                 view = capture.add_pair(left, right)
                 if view.accepted:
@@ -108,7 +101,8 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
                     folder.mkdir(parents=True, exist_ok=True)
                     for side, image in (("left", left), ("right", right)):
                         write_file(folder / f"{side}{accepted:02}.png", encode_png(image))
-                show(view.hint, view.accepted)
+                    words.print(f"pair {view.hint}")
+                status.update(f"{view.hint}; requirements to meet: {len(capture.missing())}")
                 if capture.complete:
                     break
     except KeyboardInterrupt:
@@ -127,71 +121,3 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
         )
     words.print(f"{accepted} pairs in {folder}")
     return accepted
-
-
-@contextmanager
-def _show_coverage(capture: Capture) -> Iterator[Any]:
-    """Show which of the required board poses have been captured.
-
-    The function yields a function (hint, accepted) that updates the display after each image pair.
-    If stderr is not a terminal, one line is printed for each accepted pair.
-    """
-    if not words.is_terminal:
-
-        def print_accepted(hint: str, accepted: bool) -> None:
-            if accepted:
-                words.print(f"pair {hint}")
-
-        yield print_accepted
-        return
-    from rich.live import Live
-
-    with Live(coverage_view(capture, "waiting for images"), console=words.console) as live:
-        yield lambda hint, accepted: live.update(coverage_view(capture, hint))
-
-
-def coverage_view(capture: Capture, hint: str) -> RenderableType:
-    """Return tables with the actual and the required numbers of image pairs.
-
-    The pairs are counted for each cell (part of the image), tilt of the board, and distance of the
-    board.
-
-    hint: text that is displayed below the tables.
-    """
-    from rich.columns import Columns
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    from flexsheet.launch.calibration.capture import (
-        COLUMNS,
-        DISTANCES,
-        ROWS,
-        TILTS,
-        Bin,
-        BinGroup,
-    )
-
-    def cell(one: Bin) -> Text:
-        count, required = capture.counts[one], capture.needed.get(one, 0)
-        style = "green" if count >= required else "yellow" if count else "red"
-        return Text(
-            f"{count}/{required}" if required else f"{count}", style=style if required else "dim"
-        )
-
-    tables = []
-    for side, images in (("left", BinGroup.LEFT_CELL), ("right", BinGroup.RIGHT_CELL)):
-        cells = Table(title=f"{side} image", show_header=False)
-        for row in range(ROWS):
-            cells.add_row(*(cell(Bin(images, cell=(x, row))) for x in range(COLUMNS)))
-        tables.append(cells)
-    for group, names in (
-        (BinGroup.TILT, TILTS),
-        (BinGroup.DISTANCE, DISTANCES),
-        (BinGroup.PAIRS, ("",)),
-    ):
-        table = Table(title=group, show_header=False)
-        for name in names:
-            table.add_row(name, cell(Bin(group, name)))
-        tables.append(table)
-    return Group(Columns(tables), Text(hint, style="bold"))

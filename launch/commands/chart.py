@@ -26,6 +26,9 @@ app = make_app()
 
 SYSTEM = "system"
 
+STROKE_S = 10.0
+"""The duration of each simulated stroke of `flexsheet chart system`, in seconds."""
+
 
 @app.command(
     epilog=examples(
@@ -63,16 +66,6 @@ def chart(
             help="For system: number of repetitions; each runs every configuration once.",
         ),
     ] = 12,
-    seconds: Annotated[
-        float,
-        typer.Option(
-            "--duration",
-            metavar="SECONDS",
-            min=2.0,
-            max=600.0,
-            help="For system: duration of each simulated stroke, s.",
-        ),
-    ] = 10.0,
     apparatuses: Annotated[
         int,
         typer.Option(
@@ -108,7 +101,7 @@ def chart(
                 output,
                 progress,
                 blocks=blocks,
-                seconds=seconds,
+                seconds=STROKE_S,
                 apparatuses=apparatuses,
             )
         image = output / "system.svg"

@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexsheet.launch.commands import options
-from flexsheet.launch.commands.experiment import (
-    make_result_folder,
-    print_strokes,
-)
+from flexsheet.launch.commands.experiment import make_result_folder, print_strokes
 from flexsheet.launch.commands.output import (
     examples,
     print_columns,
@@ -64,8 +61,13 @@ def demo(
         raise
     if as_json:
         _print_results(results, bag)
-    else:
-        _print_files(results, bag)
+        return
+    words.print(f"files to look at, in {folder}:")
+    # The image at the eye shows the purpose of the system, so it comes first.
+    for figure in reversed(results.figures):
+        words.print(f"  {figure.path.name}: {figure.shows}")
+    words.print(f"  {bag.name}: recording of all topics")
+    words.print(f"all figures and faults of the recording: flexsheet bag report {bag}")
 
 
 def _print_result(result: DemoResult) -> None:
@@ -84,16 +86,6 @@ def _print_result(result: DemoResult) -> None:
     sys.stdout.flush()
     for figure in result.figures:
         words.print(f"image: {figure.path}")
-
-
-def _print_files(result: DemoResult, bag: Path) -> None:
-    """Print the files that the demo has written, and what each shows."""
-    words.print(f"files to look at, in {bag.parent}:")
-    # The image at the eye shows the purpose of the system, so it comes first.
-    for figure in reversed(result.figures):
-        words.print(f"  {figure.path.name}: {figure.shows}")
-    words.print(f"  {bag.name}: recording of all topics")
-    words.print(f"all figures and faults of the recording: flexsheet bag report {bag}")
 
 
 def _print_results(result: DemoResult, bag: Path) -> None:

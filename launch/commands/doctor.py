@@ -2,33 +2,41 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
+import tempfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands import options
-from flexsheet.launch.commands.doctor_compliance import check_compliance
-from flexsheet.launch.commands.doctor_hosts import (
-    check_launch_file,
-    check_running_graph,
-    print_findings,
-)
+from flexsheet.launch.commands.graph import running_graph
 from flexsheet.launch.commands.options import JsonOption
 from flexsheet.launch.commands.output import (
     FAILED,
+    CommandError,
     examples,
+    print_columns,
     print_fields,
     print_json,
+    print_result,
     print_table,
     progress_words,
     words,
 )
 from flexsheet.messages.units import format_percent
 
+if TYPE_CHECKING:
+    from flexsheet.launch.health.doctor import Finding
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
+    from flexsheet.launch.running.runs import Run
+
 app = options.make_app()
+
+TIMEOUT_S = 4.0
+"""The maximum time to wait for the answers of the hosts, in seconds."""
 
 
 @app.command(
@@ -125,7 +133,10 @@ def doctor(
     if as_json:
         print_json([asdict(one) for one in findings])
     else:
-        print_findings(findings)
+        print_table(
+            ("host", "check", "state", "finding", "remedy"),
+            [(one.host, one.check, one.state, one.what, one.remedy) for one in findings],
+        )
     if any(one.state == "failed" for one in findings):
         raise typer.Exit(FAILED)
 
@@ -210,3 +221,175 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
             f"warning: the arms follow {1e3 * required_m_per_s:.0f} mm/s at only "
             f"{format_percent(result['fraction_at_working_speed'])} of the samples"
         )
+
+
+def check_compliance(
+    scene_file: Path, calibration: Path | None, *, delay_ms: float, as_json: bool
+) -> None:
+    """Compare the force of the object's model with the rendered force, and print the result.
+
+    The pushes are at the centre, up to the maximum depth of the scene. Also check that hand and
+    sheet cannot oscillate.
+
+    delay_ms: delay from a measurement of the finger's depth to the sheet's motion.
+
+    Raises typer.Exit with the exit code 1 if a check fails.
+    """
+    from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.sheet_calibration import SheetCalibration
+    from flexsheet.nodes.planner.compliance import ObjectCurve
+    from flexsheet.nodes.planner.force_table import choose_force_model
+
+    scene = load_scene(scene_file)
+    law, _ = choose_force_model(
+        scene, None if calibration is None else SheetCalibration.load(calibration)
+    )
+    with progress_words() as progress:
+        curve = ObjectCurve.from_rows(compute_front_curve(scene, None, progress))
+        progress("computing the rendered force")
+        result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms, progress=progress)
+    if as_json:
+        print_json(result)
+    else:
+        table = [
+            {**row, "error": row["rendered_n"] / max(row["target_n"], 1e-9) - 1}
+            for row in result["rows"]
+        ]
+        print_columns(
+            table,
+            {
+                "depth, mm": ("depth_mm", ".0f"),
+                "model, N": ("target_n", ".3f"),
+                "rendered, N": ("rendered_n", ".3f"),
+                "rendering error": ("error", "+.1%"),
+                "normal offset, mm": ("normal_offset_mm", ".2f"),
+            },
+        )
+        figures = {name: one for name, one in result.items() if name not in ("rows", "note")}
+        print_result(figures, as_json=False)
+        words.print(
+            result["note"]
+            or "the rendering error relative to the model of the object is within the tolerance"
+        )
+        words.print(
+            "`flexsheet status` states the error of this model relative to the reference (node "
+            "fem_solver)"
+        )
+    if result["note"]:
+        raise typer.Exit(FAILED)
+
+
+def check_launch_file(launch_file: Path, host: str | None) -> list[Finding]:
+    """Check this computer and the connections to all hosts of a launch file.
+
+    If the graph is running, all its hosts are asked.
+
+    host: name of this computer in the launch file; None determines it from its address.
+    """
+    plan, run = _find_graph(launch_file)
+    here = find_host(plan, run, host)
+    if run is not None and run.host not in (None, here):
+        run = None
+    words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}")
+    return asyncio.run(check_hosts(plan, here, run, TIMEOUT_S))
+
+
+def check_running_graph() -> list[Finding]:
+    """Check the hosts of the running graph; return an empty list if no graph is running.
+
+    If the graph runs on one host, only the results of the nodes' own calibration checks are
+    returned.
+    """
+    from flexsheet.launch.health.doctor_hosts import SELF_CHECK
+    from flexsheet.launch.running.runs import list_live_runs
+    from flexsheet.launch.running.tools import tools_host
+
+    if not any(run.plan_file.is_file() for run in list_live_runs()):
+        return []
+    plan, run = running_graph(None)
+    findings = asyncio.run(check_hosts(plan, tools_host(run), run, TIMEOUT_S))
+    if len(plan.hosts) == 1:
+        return [one for one in findings if one.check == SELF_CHECK]
+    return findings
+
+
+def _find_graph(launch_file: Path) -> tuple[ResolvedGraph, Run | None]:
+    """Return the resolved graph of a launch file, and its run on this computer.
+
+    A run is one execution of a graph. The result contains None instead of a run if the graph is not
+    running.
+    """
+    from flexsheet.launch.plans.plan import load_graph
+
+    plan = load_graph(launch_file)
+    try:
+        running, run = running_graph(None)
+    except CommandError:
+        return plan, None
+    same = Path(running.launch_file).resolve() == launch_file.resolve()
+    return plan, run if same or running.hash == plan.hash else None
+
+
+def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
+    """Return the name of this computer among the hosts of a graph.
+
+    requested: name that the user has given. It is None if the user has given no name.
+
+    Raises CommandError if the name is unknown, or if the addresses of this computer do not
+    determine its name.
+    """
+    from flexsheet.launch.health.doctor_hosts import list_own_addresses
+    from flexsheet.launch.plans.documents import did_you_mean
+    from flexsheet.launch.plans.plan_model import MAIN
+    from flexsheet.launch.running.tools import tools_host
+
+    if requested is not None:
+        if requested not in plan.hosts:
+            raise CommandError(
+                f"--host {requested}: unknown host; {did_you_mean(requested, list(plan.hosts))}"
+            )
+        return requested
+    if run is not None:
+        return tools_host(run)
+    own = list_own_addresses()
+    found = [name for name, address in plan.hosts.items() if address in own]
+    if MAIN in found or len(found) == 1:
+        return MAIN if MAIN in found else found[0]
+    raise CommandError(
+        f"no address of this computer matches exactly one host in {plan.launch_file} "
+        f"({', '.join(plan.hosts.values())}); name the host with --host NAME"
+    )
+
+
+async def check_hosts(
+    plan: ResolvedGraph, here: str, run: Run | None, timeout_s: float
+) -> list[Finding]:
+    """Check this computer, and test the connections to all hosts of a graph; return all findings.
+
+    here: host name of this computer.
+    """
+    from flexsheet.launch.health.doctor_hosts import (
+        check_before_start,
+        evaluate_probes,
+        find_key_problem,
+    )
+    from flexsheet.launch.health.probe import probe_all
+    from flexsheet.launch.running.keys import secret_file
+    from flexsheet.messages.security import KeyRing, write_ring
+
+    key_problem = await asyncio.to_thread(find_key_problem, plan, here)
+    with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
+        keys = None
+        if plan.keys and key_problem is None:
+            file = Path(folder) / "ring.json"
+            write_ring(file, host=here, secret_file=secret_file(here), public=plan.keys)
+            keys = KeyRing.load(file)
+        probes = await probe_all(plan, here=here, keys=keys, run=run, timeout_s=timeout_s)
+    findings = evaluate_probes(plan, here, probes)
+    if probes[here].status is None:
+        local = await asyncio.to_thread(lambda: list(check_before_start(plan, here, key_problem)))
+        first = next((i for i, one in enumerate(findings) if one.host == here), 0)
+        last = first + sum(one.host == here for one in findings)
+        findings[last:last] = local
+    return findings

@@ -125,15 +125,9 @@ def tilt(
     """Measure image errors on a tilted sheet (Furukawa et al. 2007, section VI-B, Fig. 11)."""
     from flexsheet.launch.experiments.image import TILT
 
-    bag = make_result_folder(output, "tilt") / "tilt.mcap"
-    _measure_images(
-        TILT,
-        bag,
-        launch_file,
-        options.with_scene(settings, scene),
-        apparatus=apparatus,
-        as_json=as_json,
-    )
+    given = options.with_scene(settings, scene)
+    folder = make_result_folder(output, "tilt")
+    _measure_images(TILT, folder / "tilt.mcap", launch_file, given, apparatus, as_json=as_json)
 
 
 @app.command(epilog=examples("flexsheet experiment push --json"))
@@ -154,19 +148,10 @@ def push(
     from flexsheet.launch.experiments.image import PUSH
     from flexsheet.launch.experiments.run import make_settings
 
-    settings = [
-        *make_settings(launch_file, "planner", "compliance_mode=stiffness"),
-        *options.with_scene(settings, scene),
-    ]
-    bag = make_result_folder(output, "push") / "push.mcap"
-    _measure_images(
-        PUSH,
-        bag,
-        launch_file,
-        settings,
-        apparatus=apparatus,
-        as_json=as_json,
-    )
+    given = make_settings(launch_file, "planner", "compliance_mode=stiffness")
+    given += options.with_scene(settings, scene)
+    folder = make_result_folder(output, "push")
+    _measure_images(PUSH, folder / "push.mcap", launch_file, given, apparatus, as_json=as_json)
 
 
 @app.command(epilog=examples("flexsheet experiment compliance --output runs/soft"))
@@ -244,8 +229,8 @@ def _measure_images(
     bag: Path,
     launch_file: Path,
     settings: list[str],
-    *,
     apparatus: str | None,
+    *,
     as_json: bool,
 ) -> None:
     """Run an image experiment in a graph, record it in a bag, and print the image errors."""
@@ -255,7 +240,6 @@ def _measure_images(
 
     with progress_words() as progress:
         procedure = make_image_procedure(series, series.values, image.CORRECTIONS, progress)
-        needed = ["twin/eye"]
         run_experiment(
             launch_file,
             settings,
@@ -263,14 +247,13 @@ def _measure_images(
             procedure,
             progress,
             apparatus=apparatus,
-            needed=needed,
+            needed=["twin/eye"],
             check_scene=require_cylinder,
         )
-        pictures = image.read_images(bag)
-        rows = image.make_rows(pictures, series)
+        rows = image.make_rows(image.read_images(bag), series)
     if as_json:
-        by_method = image.summarize_methods(rows)
-        print_json({"rows": rows, "by_method": by_method, "bag": str(bag)})
+        summary = image.summarize_methods(rows)
+        print_json({"rows": rows, "by_method": summary, "bag": str(bag)})
         return
     cells = [
         [f"{cell:.2f}" if isinstance(cell, float) else cell for cell in row.values()]
@@ -280,26 +263,21 @@ def _measure_images(
     words.print(f"bag: {bag}")
 
 
-def _show_ratio(ratio: float | None) -> str:
-    return "-" if ratio is None else format_percent(ratio)
-
-
 def print_followed(results: list[dict[str, Any]]) -> None:
     """Print the errors of the sheet while it followed the finger, with one line per fingertip path.
 
     Δd and Δθ are the distance and the angle between the true sheet and the true finger during
     contact.
     """
-
     columns = ["path", "in contact", "followed", "drop-outs", "true Δd, mm: mean", "95 %", "max"]
     columns += ["true Δθ, °: mean", "95 %", "max"]
     rows = []
     for result in results:
-        ratio, contact = result["following_ratio"], result["contact"]
+        ratio = result["following_ratio"]
         row = [result["path"], format_percent(result["contact_ratio"])]
-        row += [_show_ratio(ratio), str(result["drop_outs"])]
+        row += ["-" if ratio is None else format_percent(ratio), str(result["drop_outs"])]
         for key in ("true_delta_d_mm", "true_delta_theta_deg"):
-            errors = contact[key] or dict.fromkeys(("mean", "p95", "max"))
+            errors = result["contact"][key] or dict.fromkeys(("mean", "p95", "max"))
             row += [shown(errors[name], ".3f") for name in ("mean", "p95", "max")]
         rows.append(row)
     print_table(columns, rows)
@@ -345,18 +323,12 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 @app.command(
     epilog=examples(
         "flexsheet experiment stability",
-        "flexsheet experiment stability --hands 12 --json",
+        "flexsheet experiment stability --scene cylinder --json",
     )
 )
 def stability(
     *,
-    launch_file: options.LaunchOption = options.DEMO,
-    scene: options.OtherSceneOption = None,
-    settings: options.SettingsOption = None,
-    hands: Annotated[
-        int, typer.Option(min=1, max=100, help="Number of random hands per kind.")
-    ] = 4,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed of the hands.")] = 100,
+    scene_file: options.SceneOption = options.CYLINDER,
     output: options.ResultFolderOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -369,23 +341,16 @@ def stability(
     import json
 
     from flexsheet.launch.experiments import stability as experiment
-    from flexsheet.launch.experiments.run import require_scene
     from flexsheet.launch.health.compliance import compute_front_curve
-    from flexsheet.launch.plans.plan import load_graph
+    from flexsheet.launch.plans.plan import load_scene
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
-    given = options.with_scene(settings, scene)
-    loaded = require_scene(load_graph(launch_file, settings=given))
+    scene = load_scene(scene_file)
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:
-        curve = compute_front_curve(loaded, None, progress)
-        result = experiment.stability_result(
-            loaded,
-            make_force_model(loaded.sheet),
-            curve,
-            experiment.StabilitySettings(hands=hands, seed=seed),
-            progress,
-        )
+        curve = compute_front_curve(scene, None, progress)
+        model, drawn = make_force_model(scene.sheet), experiment.StabilitySettings()
+        result = experiment.stability_result(scene, model, curve, drawn, progress)
     file = folder / "stability.json"
     file.write_text(json.dumps(result, indent=1) + "\n")
     if as_json:
@@ -409,3 +374,224 @@ def stability(
             f"{error:.0f} % at the 95 % quantile, in {len(result['boundary'])} simulated cases"
         )
     words.print(f"all cases: {file}")
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
+        "flexsheet experiment robustness --seeds 0-29 --profile paper --calibrated --json",
+        "flexsheet experiment robustness --seeds 0-3 --commissioned",
+    )
+)
+def robustness(
+    *,
+    seeds: Annotated[
+        str,
+        typer.Option(
+            metavar="A-B",
+            help="Range of random seeds; each seed sets the errors of one simulated apparatus. "
+            "Seeds 0-99 are for development, higher seeds for reports.",
+        ),
+    ],
+    profile: options.ProfileOption = "modern",
+    calibrated: options.CalibratedOption = False,
+    commissioned: Annotated[
+        bool,
+        typer.Option(
+            "--commissioned",
+            help="Calibrate each simulated apparatus first, as `flexsheet commission` does, and "
+            "evaluate it in simulated time.",
+        ),
+    ] = False,
+    seconds: StrokeOption = 10.0,
+    workers: options.WorkersOption = 1,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Measure the errors of sheet, fingertip, image and force with randomly inaccurate hardware.
+
+    For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
+    separate process runs a graph with one stroke of the finger. The errors of image and force are
+    computed with the sheet at rest, without a graph. To continue an interrupted command, repeat it
+    with the same --output.
+    """
+    from flexsheet.launch.experiments import robustness as experiment
+    from flexsheet.nodes.twin.tolerance_table import Profile
+
+    selected = experiment.parse_seeds(seeds)
+    folder = make_result_folder(output, "robustness")
+    with progress_words() as progress:
+        result = experiment.run_robustness(
+            launch_file,
+            options.with_scene(settings, scene),
+            folder,
+            selected,
+            progress,
+            profile=Profile(profile),
+            calibrated=calibrated,
+            seconds=seconds,
+            workers=workers,
+            commissioned=commissioned,
+        )
+    if as_json:
+        print_json(result)
+        return
+    rows = [
+        [
+            row["seed"],
+            *(shown(row[metric]) for metric in experiment.METRICS),
+            ", ".join(row["out_of_tolerance"]) or "-",
+            ", ".join(row["flagged"]) or "-",
+        ]
+        for row in result["rows"]
+    ]
+    for statistic in ("median", "p95", "worst"):
+        values = [shown(result["summary"][metric][statistic]) for metric in experiment.METRICS]
+        rows.append([statistic, *values, "", ""])
+    print_table(["seed", *experiment.METRICS, "out of tolerance", "flagged"], rows)
+    if "commissioning" in result:
+        _print_predictions(result["commissioning"])
+    for one in result["failed"]:
+        words.print(f"seed {one['seed']} failed: {one['error']}")
+    words.print(f"rows: {folder}")
+
+
+def _print_predictions(found: dict[str, Any]) -> None:
+    """Print how often predicted and true errors are within tolerance, as confusion matrices.
+
+    The first row is for whole reports, and each further row is for one metric.
+    """
+    cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
+    every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}
+    print_table(
+        ["report", *(case.replace("_", " ") for case in cases), "stated / true error, median"],
+        [
+            [name, *(one[case] for case in cases), shown(one["stated_over_true"]["median"])]
+            for name, one in (every | found["predictions"]).items()
+        ],
+    )
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet experiment sensitivity --calibrated",
+        "flexsheet experiment sensitivity --parameter sheet.modulus_ratio --json",
+    )
+)
+def sensitivity(
+    *,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--parameter",
+            metavar="KEY",
+            help="Parameter in the table of tolerances; repeat the option; default: all.",
+        ),
+    ] = None,
+    profile: options.ProfileOption = "modern",
+    calibrated: options.CalibratedOption = False,
+    seconds: StrokeOption = 10.0,
+    workers: options.WorkersOption = 1,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Measure the errors that each hardware parameter causes if only this parameter is inaccurate.
+
+    Each parameter deviates by 1 and 3 standard deviations in both directions. Delays and tremor are
+    evaluated by strokes of the finger in simulated time. All other parameters are evaluated with
+    the sheet at rest. To continue an interrupted command, repeat it with the same --output.
+    """
+    from flexsheet.launch.experiments import select_names
+    from flexsheet.launch.experiments import sensitivity as experiment
+    from flexsheet.nodes.twin.tolerance_table import Profile, load_tolerances
+
+    selected = select_names(options.split_names(parameters), load_tolerances(), "parameter")
+    folder = make_result_folder(output, "sensitivity")
+    with progress_words() as progress:
+        result = experiment.run_sensitivity(
+            launch_file,
+            options.with_scene(settings, scene),
+            folder,
+            selected,
+            progress,
+            profile=Profile(profile),
+            calibrated=calibrated,
+            seconds=seconds,
+            workers=workers,
+        )
+    if as_json:
+        print_json(result)
+        return
+    metrics = list(result["tolerances"])
+    at_sigma = [row for row in result["rows"] if abs(row["sigma"]) == 1.0]
+    table = []
+    for one in result["ranking"]:
+        own = [row for row in at_sigma if row["parameter"] == one["parameter"]]
+        errors = [[abs(row[key]) for row in own if row[key] is not None] for key in metrics]
+        largest = [shown(max(values, default=None)) for values in errors]
+        table.append([one["parameter"], f"{one['share']:.2f}", *largest])
+    columns = ["parameter", "worst over tolerance", *(f"{key} at 1 σ" for key in metrics)]
+    print_table(columns, table)
+    for name in ("not_measured", "not_simulated"):
+        listed = dict.fromkeys(
+            row["parameter"] for row in result["rows"] if row["evaluation"] == name
+        )
+        if listed:
+            words.print(f"{name.replace('_', ' ')}: {', '.join(listed)}")
+
+
+@app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))
+def follow(
+    *,
+    finger_path: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME_OR_FILE",
+            help="CSV file with a recorded fingertip path (columns t_s,x_mm,y_mm,z_mm), or the "
+            "name of a gesture.",
+        ),
+    ],
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    simulated_time: Annotated[
+        bool,
+        typer.Option(
+            "--simulated-time",
+            help="Run tracking, planning and arms in simulated time instead of in a graph.",
+        ),
+    ] = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Measure the sheet's error while it follows a recorded finger, and compute a lower bound.
+
+    The bound is the minimum mean error that the arms can reach within their motion limits if the
+    whole recording is known in advance.
+    """
+    from flexsheet.launch.experiments import follow as experiment
+    from flexsheet.launch.experiments.finger_paths import finger_path as load_path
+
+    given = options.with_scene(settings, scene)
+    path = load_path(launch_file, finger_path, given)
+    announce_recording(finger_path, path)
+    bag = None if simulated_time else make_result_folder(output, "follow") / "follow.mcap"
+    with progress_words() as progress:
+        result = experiment.run_follow(launch_file, given, bag, path, progress, apparatus=apparatus)
+    if as_json:
+        print_json(result)
+        return
+    print_followed([result])
+    bound = result["lower_bound_mm"]
+    words.print(
+        f"lower bound of the error: mean {shown(bound['mean'])} mm, 95 % {shown(bound['p95'])} mm"
+    )
+    if bag is not None:
+        words.print(f"bag: {bag}")

@@ -41,14 +41,6 @@ STATUS_TIMEOUT_S = 3.0
 A status contains the changed parameters of a node and is published once a second.
 """
 
-ParameterArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="NODE.PARAM",
-        help="Node and parameter, separated by a dot, such as planner.max_age_s.",
-    ),
-]
-
 
 @app.command(
     "get",
@@ -82,9 +74,10 @@ def get_parameters(
     else:
         nodes = [find_node(plan, given)]
     live = {one.name: _find_live(one) for one in nodes}
-    changed = _read_changes(
-        plan, found, {name for name, names in live.items() if names is None or names}
-    )
+    wanted = {name for name, names in live.items() if names is None or names}
+    changed: dict[str, dict[str, Any]] = {}
+    if wanted:
+        run_interruptible(_receive_changes(plan, found, changed, lambda: wanted <= changed.keys()))
     rows = [
         {
             "parameter": f"{one.name}.{name}",
@@ -109,7 +102,13 @@ def get_parameters(
     context_settings={"ignore_unknown_options": True},
 )
 def set_parameter(
-    parameter: ParameterArgument,
+    parameter: Annotated[
+        str,
+        typer.Argument(
+            metavar="NODE.PARAM",
+            help="Node and parameter, separated by a dot, such as planner.max_age_s.",
+        ),
+    ],
     value: Annotated[str, typer.Argument(help="New value, in YAML syntax.")],
     run: ChangedRunOption = None,
     as_json: JsonOption = False,
@@ -122,6 +121,8 @@ def set_parameter(
     from ruamel.yaml.error import YAMLError
 
     from flexsheet.launch.plans.documents import describe_value_error, parse_value
+    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
+    from flexsheet.messages.types import ParameterChange
     from flexsheet.nodes import node_class
     from flexsheet.nodes.node import find_parameters_type
 
@@ -144,7 +145,22 @@ def set_parameter(
         texts = ("; ".join(describe_value_error(one, name)) for one in error.errors())
         raise CommandError(f"{parameter}: {', '.join(texts)}") from error
     new = checked.model_dump(mode="json")[name]
-    run_interruptible(_set(plan, found, node.name, name, new))
+    change = ParameterChange(node=node.name, parameter=name, value=json.dumps(new))
+    changed: dict[str, dict[str, Any]] = {}
+
+    async def publish() -> int:
+        with closing(GraphWriter(plan, found, ["parameter"])) as writer:
+            await asyncio.sleep(READER_RECONNECT_S)
+            writer.publish("parameter", change)
+            return await _receive_changes(
+                plan, found, changed, lambda: changed.get(node.name, {}).get(name) == new
+            )
+
+    if run_interruptible(publish()):
+        raise CommandError(
+            f"{parameter}: the node did not confirm the change; see flexsheet logs {node.name}",
+            FAILED,
+        )
     result = {"parameter": parameter, "value": new}
     print_outcome(result, f"{parameter} = {json.dumps(new)}", as_json=as_json)
 
@@ -176,45 +192,18 @@ def _find_live(node: ResolvedNode) -> frozenset[str] | None:
         return None
 
 
-def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:
-    """Return the changed parameters of running nodes, by node and parameter name."""
-    found: dict[str, dict[str, Any]] = {}
-    if nodes:
-        run_interruptible(_await_statuses(plan, run, lambda: nodes <= found.keys(), found))
-    return found
-
-
-async def _await_statuses(
-    plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
+async def _receive_changes(
+    plan: ResolvedGraph,
+    run: Run,
+    changed: dict[str, dict[str, Any]],
+    done: Callable[[], bool],
 ) -> int:
-    """Receive statuses of nodes until `done` returns True, and store the changed parameters.
+    """Receive statuses of nodes until `done` returns True; return 0, or 1 on a timeout.
 
-    The parameters are stored in `found` by node name and parameter name. Returns 0, or 1 on a
-    timeout.
+    changed: mapping to which the changed parameters are added, by node name and parameter name.
     """
 
     def add(status: Status) -> None:
-        found[status.node] = json.loads(status.changed_parameters)
+        changed[status.node] = json.loads(status.changed_parameters)
 
     return int(not await receive_until(plan, run, {"status": add}, done, STATUS_TIMEOUT_S))
-
-
-async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) -> int:
-    """Publish a parameter change, and wait until the node's status confirms it.
-
-    Returns 0, the exit code. Raises CommandError if the change is not confirmed.
-    """
-    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
-    from flexsheet.messages.types import ParameterChange
-
-    with closing(GraphWriter(plan, run, ["parameter"])) as writer:
-        await asyncio.sleep(READER_RECONNECT_S)
-        change = ParameterChange(node=node, parameter=name, value=json.dumps(value))
-        writer.publish("parameter", change)
-        found: dict[str, dict[str, Any]] = {}
-        if await _await_statuses(plan, run, lambda: found.get(node, {}).get(name) == value, found):
-            raise CommandError(
-                f"{node}.{name}: the node did not confirm the change; see flexsheet logs {node}",
-                FAILED,
-            )
-    return 0

@@ -70,7 +70,6 @@ def precompute(
         load_or_compute_bounds(scene.camera.rate_hz, cache, progress)
         if scene.object.material is not None:
             files["force_table"] = precompute_force_table(scene, cache, progress)
-        if scene.object.material is not None:
             try:
                 files["soft_body"] = precompute_soft_body(
                     scene,

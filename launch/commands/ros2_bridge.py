@@ -25,21 +25,11 @@ app = options.make_app()
     epilog=examples(
         "flexsheet ros2-bridge",
         "flexsheet ros2-bridge --topic fingertip --topic arm_left --topic arm_right",
-        "flexsheet ros2-bridge --domain 5",
     )
 )
 def ros2_bridge(
     *,
     topics: options.TopicsOption = None,
-    domain: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            max=232,
-            help="DDS domain number; default: value of the environment variable ROS_DOMAIN_ID, or "
-            "0 if it is not set.",
-        ),
-    ] = None,
     interface: Annotated[
         str,
         typer.Option(
@@ -55,7 +45,8 @@ def ros2_bridge(
     """Publish the topics of the running graph to ROS 2, until Ctrl-C.
 
     RViz can then show the arms, the sheet and the fingertip, and `ros2 bag record` can record them.
-    ROS nodes cannot publish in the graph. By default the bridge uses the loopback interface.
+    ROS nodes cannot publish in the graph. By default the bridge uses the loopback interface. The
+    environment variable ROS_DOMAIN_ID sets the DDS domain.
     """
     from flexsheet.launch.ros2.bridge import list_default_topics
     from flexsheet.launch.ros2.dds import MAX_DOMAIN, RosParticipant
@@ -70,15 +61,12 @@ def ros2_bridge(
                 f"--topic {name}: the topic has no writer in the running graph; "
                 "`flexsheet topic list` lists its topics"
             )
-    if domain is None:
-        given = os.environ.get("ROS_DOMAIN_ID", "0")
-        if not given.isdigit() or int(given) > MAX_DOMAIN:
-            raise CommandError(
-                f"ROS_DOMAIN_ID={given}: expected a number from 0 to {MAX_DOMAIN}; correct it, or "
-                "give --domain"
-            )
-        domain = int(given)
-    participant = RosParticipant(domain, interface)
+    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    if not domain.isdigit() or int(domain) > MAX_DOMAIN:
+        raise CommandError(
+            f"ROS_DOMAIN_ID={domain}: expected a number from 0 to {MAX_DOMAIN}; correct it"
+        )
+    participant = RosParticipant(int(domain), interface)
     words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop")
     published: Counter[str] = Counter()
     run_interruptible(

@@ -8,11 +8,7 @@ from typing import Annotated
 import typer
 
 from flexsheet.launch.commands.options import SCENE, JsonOption, make_app, result_file
-from flexsheet.launch.commands.output import (
-    examples,
-    print_json,
-    words,
-)
+from flexsheet.launch.commands.output import examples, print_json, words
 
 app = make_app()
 

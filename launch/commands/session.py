@@ -69,13 +69,27 @@ def status(run: options.RunOption = None, as_json: options.JsonOption = False) -
     statuses: dict[str, Status] = {}
     hosts: dict[str, HostStatus] = {}
     arms: dict[str, ArmState] = {}
-    run_interruptible(_collect_statuses(plan, found, statuses, hosts, arms))
+    arm_topics = plan.writers.keys() & ARM_TOPICS
+    handlers: dict[str, Callable[[Any], None]] = {
+        "status": lambda message: statuses.update({message.node: message}),
+        "host": lambda message: hosts.update({message.host: message}),
+        **dict.fromkeys(arm_topics, lambda message: arms.update({message.side: message})),
+    }
+
+    def complete() -> bool:
+        return (
+            plan.nodes.keys() <= statuses.keys()
+            and plan.hosts.keys() <= hosts.keys()
+            and len(arms) == len(arm_topics)
+        )
+
+    run_interruptible(receive_until(plan, found, handlers, complete, STATUS_TIMEOUT_S))
     notes = {
         str(node.arm_side): statuses[node.name].note_text
         for node in plan.nodes.values()
         if node.arm_side and node.name in statuses
     }
-    arm_rows = describe_arms(arms, notes) if plan.writers.keys() & ARM_TOPICS else []
+    arm_rows = describe_arms(arms, notes) if arm_topics else []
     rows = [describe_node(node, statuses.get(node.name)) for node in plan.nodes.values()]
     suspicions = _list_suspicions(statuses)
     estops = {name: one.estop for name, one in hosts.items() if one.estop is not None}
@@ -134,36 +148,6 @@ def _print_shown(plan: ResolvedGraph, shown: Run, live: Sequence[Run]) -> None:
         words.print(f"to show {describe_launch(one)}: flexsheet status --run {one.directory}")
 
 
-async def _collect_statuses(
-    plan: ResolvedGraph,
-    run: Run,
-    statuses: dict[str, Status],
-    hosts: dict[str, HostStatus],
-    arms: dict[str, ArmState],
-) -> int:
-    """Receive the statuses of all nodes, hosts and arms for at most STATUS_TIMEOUT_S.
-
-    The statuses are stored by name in `statuses`, `hosts` and `arms`. The result is the exit code
-    0.
-    """
-    arm_topics = plan.writers.keys() & ARM_TOPICS
-    handlers: dict[str, Callable[[Any], None]] = {
-        "status": lambda message: statuses.update({message.node: message}),
-        "host": lambda message: hosts.update({message.host: message}),
-        **dict.fromkeys(arm_topics, lambda message: arms.update({message.side: message})),
-    }
-
-    def complete() -> bool:
-        return (
-            plan.nodes.keys() <= statuses.keys()
-            and plan.hosts.keys() <= hosts.keys()
-            and len(arms) == len(arm_topics)
-        )
-
-    await receive_until(plan, run, handlers, complete, STATUS_TIMEOUT_S)
-    return 0
-
-
 def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
     """Return a table row with the status of a node.
 
@@ -189,42 +173,44 @@ def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
     }
 
 
+COUNT_TEXTS = {
+    "superseded": "skipped: {counts}. A newer message replaced each before the node read it, and "
+    "the node needs only the newest. This is normal: a node with a lower rate than a topic always "
+    "skips some. If sheet or image are late, `flexsheet doctor`, row `load`, shows whether the "
+    "computer is too slow.",
+    "overflowed": "skipped: {counts}. The node needed these messages, but was too slow to read "
+    "them. Reduce the load of the computer: see `flexsheet doctor`, row `load`.",
+    "lost": "lost: {counts}. These messages were lost in transit, or were not valid. This must "
+    "not happen: `flexsheet logs {node}` shows the reason.",
+}
+"""The explanations of message counts.
+
+The placeholders are the counts of all nodes, and the first of these nodes.
+"""
+
+
 def explain_counts(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return an explanation of each nonzero message count in the table of `flexsheet status`."""
     from flexsheet.messages.topics import Delivery, find_topic
 
-    superseded, overflowed, lost = list[str](), list[str](), list[str]()
+    counts: dict[str, dict[str, dict[str, int]]] = {name: {} for name in COUNT_TEXTS}
     for row in rows:
-        newest, every, missing = dict[str, int](), dict[str, int](), dict[str, int]()
         for port in row["inputs"]:
-            is_every = find_topic(port["topic"]).delivery is Delivery.EVERY
+            topic, missing = port["topic"], port["gaps"] + port["rejected"]
+            every = find_topic(topic).delivery is Delivery.EVERY
             if row["skipped"] and port["dropped"]:
-                (every if is_every else newest)[port["topic"]] = port["dropped"]
-            if row["lost"] and (count := port["gaps"] + port["rejected"]):
-                missing[port["topic"]] = count
-        for texts, counts in ((superseded, newest), (overflowed, every), (lost, missing)):
-            if counts:
-                texts.append(f"{row['node']} {_describe_counts(counts)}")
-    lines = []
-    if superseded:
-        lines.append(
-            f"skipped: {', '.join(superseded)}. A newer message replaced each before the node read "
-            "it, and the node needs only the newest. This is normal: a node with a lower rate than "
-            "a topic always skips some. If sheet or image are late, `flexsheet doctor`, row "
-            "`load`, shows whether the computer is too slow."
+                skipped = counts["overflowed" if every else "superseded"]
+                skipped.setdefault(row["node"], {})[topic] = port["dropped"]
+            if row["lost"] and missing:
+                counts["lost"].setdefault(row["node"], {})[topic] = missing
+    return [
+        COUNT_TEXTS[name].format(
+            counts=", ".join(f"{node} {_describe_counts(one)}" for node, one in nodes.items()),
+            node=next(iter(nodes)),
         )
-    if overflowed:
-        lines.append(
-            f"skipped: {', '.join(overflowed)}. The node needed these messages, but was too slow "
-            f"to read them. Reduce the load of the computer: see `flexsheet doctor`, row `load`."
-        )
-    if lost:
-        lossy = next(row["node"] for row in rows if row["lost"])
-        lines.append(
-            f"lost: {', '.join(lost)}. These messages were lost in transit, or were not valid. "
-            f"This must not happen: `flexsheet logs {lossy}` shows the reason."
-        )
-    return lines
+        for name, nodes in counts.items()
+        if nodes
+    ]
 
 
 def _describe_counts(counts: Mapping[str, int]) -> str:

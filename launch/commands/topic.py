@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,19 +47,20 @@ if TYPE_CHECKING:
 app = make_app("List topics, and read or publish them in the running graph.")
 
 
-def _count_option(default: str) -> Any:
-    return typer.Option(
+CountOption = Annotated[
+    int | None,
+    typer.Option(
         "-t",
         "--count",
-        metavar="N",
-        help=f"Number of messages after which the command stops; default: {default}.",
+        help="Number of messages after which the command stops; default: it runs until Ctrl-C.",
         min=1,
-    )
-
-
-CountOption = Annotated[int | None, _count_option("it runs until Ctrl-C")]
+    ),
+]
 REPORT_DELAY_S = 3.0
 """The time (s) after which the command reports that no message has arrived."""
+
+PUBLISHING_PERIOD_S = 1.0
+"""The time between two messages of `flexsheet topic pub --count`, in seconds."""
 
 SHORT_ARRAY = 36
 """The maximum number of elements of an array that is printed completely."""
@@ -119,9 +120,8 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
     }
     try:
         plan, _ = running_graph(run)
-    except CommandError:
-        if run is not None:
-            raise
+    except NoGraphError:
+        pass
     else:
         description["writers"] = [writer.name for writer in plan.writers.get(topic, ())]
         description["readers"] = list_readers(plan, topic)
@@ -167,11 +167,10 @@ def echo(
             metavar="FIELD", help="Field to print instead of the message, such as left.fx_px."
         ),
     ] = None,
-    full: Annotated[bool, typer.Option("-f", "--full", help="Print long arrays in full.")] = False,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the messages of a topic as they arrive.
+    """Print the messages of a topic as they arrive; long arrays are summarized.
 
     With --json, each message is a JSON document on its own line.
     """
@@ -180,13 +179,13 @@ def echo(
     from flexsheet.messages.topics import find_topic
 
     def show(message: Message, header: Header) -> None:
-        value = _get_field(message, field, topic)
+        value = to_plain(_get_field(message, field, topic))
         if as_json:
-            print_json_line({"header": asdict(header), "message": to_plain(value, full=full)})
+            print_json_line({"header": asdict(header), "message": value})
             return
         seconds = f"{header.source_ns * 1e-9:.6f}"
         print(f"--- {header.writer} #{header.sequence}, source {seconds} s")
-        print("\n".join(_format_lines(to_plain(value, full=full))), flush=True)
+        print("\n".join(_format_lines(value)), flush=True)
 
     limit = 1 if once else count
     raise typer.Exit(run_interruptible(_read(find_topic(topic), run, show, limit, timeout)))
@@ -208,7 +207,25 @@ def hz(
     timestamp, such as the exposure of an image, until the message arrives at this command. It is
     not measured for a writer on another computer, because the clock of that computer can differ.
     """
-    print_rows(measure_rates(_measure(topic, run, duration)), as_json=as_json)
+    from flexsheet.messages.clock import SystemClock
+    from flexsheet.messages.topics import find_topic
+
+    found, clock = find_topic(topic), SystemClock()
+    arrivals: list[Arrival] = []
+
+    def receive(frames: Any, header: Header) -> None:
+        size_bytes = sum(memoryview(frame).nbytes for frame in frames)
+        arrivals.append(Arrival(header, size_bytes, clock.now_ns()))
+
+    async def listen() -> int:
+        with receiving([make_listener(found, run, receive, raw=True)]):
+            await asyncio.sleep(duration)
+        return 0
+
+    run_interruptible(listen())
+    if not arrivals:
+        raise make_silence_error(topic, duration)
+    print_rows(measure_rates(arrivals, clock.id), as_json=as_json)
 
 
 @app.command(
@@ -223,21 +240,10 @@ def pub(
     message: Annotated[
         str, typer.Argument(help="Message in YAML or JSON, or @FILE to read it from a file.")
     ],
-    rate: Annotated[
-        float | None,
-        typer.Option(
-            "-r",
-            "--rate",
-            metavar="HZ",
-            min=0.01,
-            help="Rate at which the message is repeated, Hz; default: 1 Hz with --count. Without "
-            "both options, the message is sent once.",
-        ),
-    ] = None,
-    once: Annotated[
-        bool, typer.Option("-1", "--once", help="Send one message (default without --rate).")
-    ] = False,
-    count: Annotated[int | None, _count_option("1, or with --rate until Ctrl-C")] = None,
+    count: Annotated[
+        int,
+        typer.Option("-t", "--count", help="Number of times to send it, once a second.", min=1),
+    ] = 1,
     run: ChangedRunOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -247,26 +253,31 @@ def pub(
     Subscribers that connect later receive a message of a latched topic only while this command
     runs.
     """
-    from flexsheet.launch.running.tools import find_tool_writer
+    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter, find_tool_writer
     from flexsheet.messages.topics import find_topic
 
-    found, run = find_topic(topic), choose_run(run)
-    find_tool_writer(*running_graph(run), found.name)  # before errors in the message's fields
-    built = _parse_message(found, message)
-    times = 1 if once or (rate is None and count is None) else count
-    sent = 0
+    found, graph = find_topic(topic), running_graph(choose_run(run))
+    find_tool_writer(*graph, found.name)  # before errors in the message's fields
+    built, sent = _parse_message(found, message), 0
 
-    def on_sent(count: int) -> None:
+    async def publish() -> int:
         nonlocal sent
-        sent = count
+        with closing(GraphWriter(*graph, [found.name])) as writer:
+            await asyncio.sleep(READER_RECONNECT_S)
+            while sent < count:
+                if sent:
+                    await asyncio.sleep(PUBLISHING_PERIOD_S)
+                writer.publish(found.name, built)
+                sent += 1
+            # Wait for readers that are still connecting, because the latched message is lost with
+            # the publisher's socket.
+            await asyncio.sleep(READER_RECONNECT_S / 2)
+        return 0
 
-    code = run_interruptible(
-        _publish(found, built, run=run, rate_hz=rate or 1.0, times=times, on_sent=on_sent)
-    )
+    run_interruptible(publish())
     print_outcome({"topic": topic, "sent": sent}, f'sent {sent} on "{topic}"', as_json=as_json)
     if not as_json:
         words.print("if a node refuses the message, `flexsheet status` shows why", style="dim")
-    raise typer.Exit(code)
 
 
 def make_silence_error(topic: str, duration_s: float) -> CommandError:
@@ -289,29 +300,21 @@ class Arrival:
     received_ns: int
 
 
-def _by_writer(arrivals: Sequence[Arrival]) -> list[list[Arrival]]:
-    """Group messages by writer.
-
-    A writer that restarts begins a new group, because its sequence numbers restart.
-    """
-    groups: dict[tuple[str, int], list[Arrival]] = {}
-    for one in arrivals:
-        groups.setdefault((one.header.writer, one.header.epoch), []).append(one)
-    return list(groups.values())
-
-
-def measure_rates(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
+def measure_rates(arrivals: Sequence[Arrival], own_clock: str) -> list[dict[str, Any]]:
     """Return one row per writer with rate, lost messages, bandwidth, and statistics (ms) of times.
 
-    The times are the interval between publications, and the age of the data at arrival.
+    The times are the interval between publications, and the age of the data at arrival. A writer
+    that restarts has a new row, because its sequence numbers restart.
+
+    own_clock: id of the clock of this computer.
     """
     import numpy as np
 
-    from flexsheet.messages.clock import SystemClock
-
-    own_clock = SystemClock().id
+    groups: dict[tuple[str, int], list[Arrival]] = {}
+    for one in arrivals:
+        groups.setdefault((one.header.writer, one.header.epoch), []).append(one)
     rows = []
-    for own in _by_writer(arrivals):
+    for own in groups.values():
         sequences = np.array([one.header.sequence for one in own])
         stamps_s = np.array([one.header.publish_ns for one in own]) * 1e-9
         span_s = float(stamps_s[-1] - stamps_s[0])
@@ -351,20 +354,15 @@ def _summarize(values: list[float]) -> dict[str, float] | None:
     }
 
 
-def to_plain(value: Any, *, full: bool) -> Any:
-    """Convert a message or field to JSON types.
-
-    full: whether long arrays are returned completely instead of as a summary.
-    """
+def to_plain(value: Any) -> Any:
+    """Convert a message or field to JSON types; long arrays are replaced by a summary."""
     import numpy as np
     from pydantic import BaseModel
 
     if isinstance(value, BaseModel):
-        return {
-            name: to_plain(getattr(value, name), full=full) for name in type(value).model_fields
-        }
+        return {name: to_plain(getattr(value, name)) for name in type(value).model_fields}
     if isinstance(value, np.ndarray):
-        if full or value.size <= SHORT_ARRAY:
+        if value.size <= SHORT_ARRAY:
             return value.tolist()
         return {
             "dtype": str(value.dtype),
@@ -373,7 +371,7 @@ def to_plain(value: Any, *, full: bool) -> Any:
             "max": value.max().item(),
         }
     if isinstance(value, tuple | list):
-        return [to_plain(item, full=full) for item in value]
+        return [to_plain(item) for item in value]
     return value
 
 
@@ -425,15 +423,6 @@ def _get_field(message: Message, path: str | None, topic: str) -> Any:
     return value
 
 
-def _report_no_message(topic: Topic) -> None:
-    when = (
-        "this topic is published only when its value changes"
-        if topic.rate_hz is None
-        else "check its writer: flexsheet topic echo status"
-    )
-    words.print(f'no message on "{topic.name}" yet ({when}); press Ctrl-C to stop', style="dim")
-
-
 async def _read(
     topic: Topic, run: Path | None, show: Any, limit: int | None, timeout_s: float | None
 ) -> int:
@@ -441,7 +430,11 @@ async def _read(
     subscriber = make_listener(
         topic, run, lambda message, header: arrived.put_nowait((message, header))
     )
-    waiting = asyncio.get_running_loop().call_later(REPORT_DELAY_S, _report_no_message, topic)
+    why = "check its writer: flexsheet topic echo status"
+    if topic.rate_hz is None:
+        why = "this topic is published only when its value changes"
+    text = f'no message on "{topic.name}" yet ({why}); press Ctrl-C to stop'
+    waiting = asyncio.get_running_loop().call_later(REPORT_DELAY_S, words.print, text)
     with receiving([subscriber]):
         try:
             shown = 0
@@ -455,36 +448,6 @@ async def _read(
             raise make_silence_error(topic.name, timeout_s or 0.0) from None
         finally:
             waiting.cancel()
-    return 0
-
-
-def _measure(topic: str, run: Path | None, duration_s: float) -> list[Arrival]:
-    """Record the messages that arrive on a topic during a given time.
-
-    Raises CommandError if no message arrives.
-    """
-    from flexsheet.messages.topics import find_topic
-
-    arrivals: list[Arrival] = []
-    run_interruptible(_collect(find_topic(topic), run, arrivals, duration_s))
-    if not arrivals:
-        raise make_silence_error(topic, duration_s)
-    return arrivals
-
-
-async def _collect(
-    topic: Topic, run: Path | None, arrivals: list[Arrival], duration_s: float
-) -> int:
-    from flexsheet.messages.clock import SystemClock
-
-    clock = SystemClock()
-
-    def receive(frames: Any, header: Header) -> None:
-        size_bytes = sum(memoryview(frame).nbytes for frame in frames)
-        arrivals.append(Arrival(header, size_bytes, clock.now_ns()))
-
-    with receiving([make_listener(topic, run, receive, raw=True)]):
-        await asyncio.sleep(duration_s)
     return 0
 
 
@@ -539,30 +502,3 @@ def _parse_message(topic: Topic, text: str) -> Message:
     if problem := message.find_problem():
         raise CommandError(f"{origin}: {problem}")
     return message
-
-
-async def _publish(
-    topic: Topic,
-    message: Message,
-    *,
-    run: Path | None,
-    rate_hz: float,
-    times: int | None,
-    on_sent: Callable[[int], None],
-) -> int:
-    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
-
-    plan, found = running_graph(run)
-    with closing(GraphWriter(plan, found, [topic.name])) as writer:
-        await asyncio.sleep(READER_RECONNECT_S)
-        sent = 0
-        while times is None or sent < times:
-            if sent:
-                await asyncio.sleep(1.0 / rate_hz)
-            writer.publish(topic.name, message)
-            sent += 1
-            on_sent(sent)
-        # Wait for readers that are still connecting, because the latched message is lost with the
-        # publisher's socket.
-        await asyncio.sleep(READER_RECONNECT_S / 2)
-    return 0
