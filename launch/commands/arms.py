@@ -276,7 +276,7 @@ class _Arms:
 
     async def wait_for(self, done: Callable[[ArmState], bool]) -> bool:
         """Receive states until `done` returns True for both arms; return False on a timeout."""
-        handlers = {
+        handlers: dict[str, Callable[[Any], None]] = {
             "arm_left": self.add_state,
             "arm_right": self.add_state,
             "status": self.add_status,
