@@ -119,8 +119,7 @@ class RosParticipant:
             self._participant = DomainParticipant(domain)
         except DDSException as error:
             raise Ros2Error(
-                f"the DDS domain {domain} on {interface} cannot be joined: {error}; "
-                "check ROS_DOMAIN_ID and --interface"
+                f"DDS domain {domain} on {interface}: {error}; check ROS_DOMAIN_ID and --interface"
             ) from error
         self._writers: dict[str, Any] = {}
 
