@@ -45,10 +45,12 @@ $(DEV_STAMP): requirements-dev.lock $(STAMP)
 lock:  ## write all lock files again, after a change of dependencies
 	$(PYTHON) -m venv $(LOCK)
 	$(LOCK)/bin/pip install --quiet --disable-pip-version-check pip-tools
-	$(call compile,--all-build-deps --extra all,requirements.lock,pyproject.toml)
-	$(call compile,--all-build-deps --extra all --extra ros2 --extra dev,requirements-dev.lock,pyproject.toml)
+	$(call compile,--all-build-deps $(EXTRAS),requirements.lock,pyproject.toml)
+	$(call compile,--all-build-deps $(EXTRAS) --extra ros2 --extra dev,requirements-dev.lock,pyproject.toml)
 	$(call compile,,website/requirements.lock,website/requirements.in)
 
+# Those of the extra `all`; pip-tools would list this project itself for a reference to its extras.
+EXTRAS = $(addprefix --extra ,projector console charts meshes cluster view)
 compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) \
 	--strip-extras --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
 	--no-emit-find-links -o $(2) $(3)
