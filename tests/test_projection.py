@@ -209,6 +209,7 @@ def test_indentation_shapes_are_cached(tmp_path: Path, monkeypatch: pytest.Monke
         return few_dents()
 
     monkeypatch.setattr(deflection_cache, "solve_indentation_basis", solve_few)
+    monkeypatch.setattr(deflection_cache, "FOLDER", tmp_path / "shapes")
     assert load_cached(deflection_cache.shapes_cache(SCENE), tmp_path) is None
     deflection_cache.load_or_compute(SCENE, tmp_path)
     kept = deflection_cache.load_or_compute(SCENE, tmp_path)
@@ -235,6 +236,7 @@ def test_shapes_of_another_finger_are_interpolated_and_of_another_width_scaled(
         return replace(found, coefficients=found.coefficients * finger_radius_m / 0.007)
 
     monkeypatch.setattr(deflection_cache, "solve_indentation_basis", solve_few)
+    monkeypatch.setattr(deflection_cache, "FOLDER", tmp_path / "shapes")
     finger = SCENE.finger.model_copy(update={"radius_m": 0.0075})
     sheet = SCENE.sheet.model_copy(update={"width_m": 1.01 * SCENE.sheet.width_m})
     scene = SCENE.model_copy(update={"finger": finger, "sheet": sheet})

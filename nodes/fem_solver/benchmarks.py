@@ -45,7 +45,7 @@ TABLES = {
 }
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
-REFERENCE_RATIOS = (0.32, 0.64)
+REFERENCE_RATIOS = (0.32, 0.45)
 """The distances between the skin nodes of the reference meshes near the finger, in finger radii.
 The finest mesh comes first."""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
