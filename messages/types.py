@@ -719,9 +719,6 @@ class FingerPath(Message):
         description="rounded_lines: points are corners, rounded over +-40 ms; spline: points "
         "are samples of a smooth motion that begins and ends at rest",
     )
-    stroke_s: Positive | None = Field(
-        default=None, description="duration of the motion, if the path is a stroke of an experiment"
-    )
 
     def find_problem(self) -> str:
         """Return why the path is not valid, or "".
@@ -759,10 +756,6 @@ class TwinFinger(Message):
     path_done: bool
     path_time_s: Finite = Field(
         description="time since the start of the path; negative before the first point"
-    )
-    path_stroke_s: Positive | None = Field(
-        default=None,
-        description="duration of the motion, if the finger path is a stroke of an experiment",
     )
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3

@@ -151,7 +151,7 @@ def _write_step(
     tip, pose = finger_at(angle_rad), sheet_at(angle_rad)
     recorded_s = seconds + LATENCY_S
     true = TwinFinger(path_label=stroke_label(STROKE_S), path_done=False, path_time_s=seconds,
-                      path_stroke_s=STROKE_S, position_world_m=tip,
+                      position_world_m=tip,
                       velocity_world_m_per_s=np.zeros(3))  # fmt: skip
     desk.write("twin/finger", true, seconds)
     if not SILENCE_S[0] < seconds < SILENCE_S[1] - 1e-9:

@@ -197,7 +197,7 @@ def test_the_script_that_moves_the_finger_runs(tmp_path: Path) -> None:
         ports[node][key] = int(port)
     nodes = {node: {"parameters": values} for node, values in ports.items()}
     launch_file.write_text(f"{launch_file.read_text()}nodes: {json.dumps(nodes)}\n")
-    printed = run_script(python_block("library.md", "flexsheet.Driver"), tmp_path)
+    printed = run_script(python_block("library.md", "flexsheet.Driver("), tmp_path)
     position_m = [float(one) for one in printed.strip("[]\n ").split()]
     assert position_m == pytest.approx([0.0, 0.0, 0.02], abs=0.003)
 

@@ -34,7 +34,7 @@ def render(results: Path) -> str:
             effects = _format_effects(found, one["parameter"])
             row = (f"`{one['parameter']}`", *effects, f"{one['share']:.2f}")
             profiles.setdefault(row, []).append(f"`{profile.value}`")
-        notes.append(f"{record['machine']}; `{record['command']}`.\n")
+        notes.append(f"{record['machine']}; commit `{record['code']['commit']}`.\n")
     rows = [(row[0], ", ".join(names), *row[1:]) for row, names in profiles.items()]
     return "\n".join([format_table(heads, rows), *notes])
 

@@ -46,8 +46,8 @@ def render_system(results: Path) -> str:
             ", ".join(key.removesuffix(".p95") for key in point["failing"]) or "–",
         )
         rows.append(cells)
-    machine = f"{record['machine']}, load {record['load']:.1f}; `{record['command']}`."
-    return f"{format_table(heads, rows)}\n{machine}"
+    note = f"{record['machine']}, load {record['load']:.1f}; commit `{record['code']['commit']}`."
+    return f"{format_table(heads, rows)}\n{note}"
 
 
 def _format_error(point: Mapping[str, Any], key: str) -> str:

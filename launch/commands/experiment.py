@@ -28,7 +28,7 @@ app = options.make_app("Run the experiments of Furukawa et al. 2007, and further
 StrokeOption = Annotated[
     float,
     typer.Option(
-        "--duration", metavar="SECONDS", min=1.0, max=600.0, help="Duration of each stroke, s."
+        "--seconds", metavar="SECONDS", min=1.0, max=600.0, help="Duration of each stroke, s."
     ),
 ]
 
@@ -49,7 +49,7 @@ def make_result_folder(output: Path | None, name: str) -> Path:
 
 @app.command(
     epilog=examples(
-        "flexsheet experiment stroke --duration 30",
+        "flexsheet experiment stroke --seconds 30",
         "flexsheet experiment stroke --set planner.prediction_horizon_s=0 --json",
     )
 )

@@ -160,7 +160,6 @@ def stroke_path(scene: Scene, seconds: float) -> FingerPath:
         positions_world_m=apply(world_from_object, points),
         wander_m=WANDER_M,
         tremor_m=TREMOR_M,
-        stroke_s=seconds,
     )
 
 

@@ -93,7 +93,6 @@ class TwinFingerNode(Node):
     motion: FingerMotion
     motion_from_ns = 0
     path_label = ""
-    path_stroke_s: float | None = None
     refusal = ""
     missed_frames = 0
     coupled: CoupledFinger | None = None
@@ -227,7 +226,6 @@ class TwinFingerNode(Node):
             joined_by=path.joined_by,
         )
         self.motion_from_ns, self.path_label = now_ns, path.label
-        self.path_stroke_s = path.stroke_s
 
     def truth(self, at_ns: int) -> FingerState:
         """Return the true state of the fingertip at the time `at_ns` of this node's clock."""
@@ -256,7 +254,6 @@ class TwinFingerNode(Node):
                 path_label=self.path_label,
                 path_done=state.path_done,
                 path_time_s=state.path_time_s,
-                path_stroke_s=self.path_stroke_s,
                 position_world_m=state.position,
                 velocity_world_m_per_s=state.velocity,
                 force_world_n=state.force,
