@@ -5,24 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.types import Status
 from flexsheet.messages.wire import encode
+from flexsheet.nodes.console.latest_messages import LatestMessages
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-class FixedMessages:
-    """A message source whose messages the test sets."""
-
-    def __init__(self, **messages: Message) -> None:
-        self.held = {
-            name.replace("__", "/"): (message, Header(1, 10_000_000, 13_000_000, "c", "w", 1))
-            for name, message in messages.items()
-        }
-
-    def latest(self, name: str, kind: Any) -> Any:
-        return self.held.get(name)
 
 
 def status_of(node: str, **changes: Any) -> Status:
@@ -46,3 +36,11 @@ def status_of(node: str, **changes: Any) -> Status:
 def frames_of(message: Message, sequence: int = 1) -> tuple[list[Any], Header]:
     header = Header(sequence, 5, 6, "clock", "writer", 3)
     return encode(message, header), header
+
+
+def latest_messages(**messages: Message) -> LatestMessages:
+    """Return a store with a message of each named topic; "__" in a name stands for "/"."""
+    store = LatestMessages(lambda topic, error: pytest.fail(f"{topic.name}: {error}"))
+    for name, message in messages.items():
+        store.put(name.replace("__", "/"), frames_of(message)[0])
+    return store

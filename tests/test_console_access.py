@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gzip
-import re
 import socket
 from collections.abc import Iterator
 
@@ -14,8 +12,12 @@ import websockets
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from flexsheet.nodes.console.access_control import ConsoleError, is_allowed, start_server
-from flexsheet.nodes.console.html_head import inject_assets
+from flexsheet.nodes.console.access_control import (
+    ConsoleError,
+    inject_assets,
+    is_allowed,
+    start_server,
+)
 from tests.waiting import DEADLINE_S
 
 
@@ -51,19 +53,14 @@ def test_only_pages_of_the_console_itself_may_ask(request_: Request, allowed: bo
     assert is_allowed(request_) == allowed
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_the_page_is_served_with_our_title_style_and_script(packed: bool) -> None:
+def test_the_page_is_served_with_our_style_and_script() -> None:
     def answer(page: bytes, kind: str = "text/html; charset=utf-8") -> Response:
-        body = gzip.compress(page) if packed else page
-        headers = Headers({"Content-Type": kind, "Content-Length": str(len(body))})
-        headers["Content-Encoding"] = "gzip" if packed else "identity"
-        return Response(200, "OK", headers, body)
+        headers = Headers({"Content-Type": kind, "Content-Length": str(len(page))})
+        return Response(200, "OK", headers, page)
 
     served = inject_assets(answer(b"<html><head><title>x</title></head><body></body></html>"))
     assert served.headers.get_all("Content-Length") == [str(len(served.body))]
-    page = gzip.decompress(served.body) if packed else bytes(served.body)
-    head, _, rest = page.partition(b"</head>")
-    assert re.findall(rb"<title>(.*?)</title>", head) == [b"flexsheet console"]
+    head, _, rest = bytes(served.body).partition(b"</head>")
     assert b"--fs-text" in head
     assert b"E-STOP" in head
     assert rest == b"<body></body></html>"
@@ -101,6 +98,7 @@ HOST = b"Host: 127.0.0.1\r\n"
 async def test_foreign_requests_are_answered_with_403(port: int) -> None:
     for headers, expected in (
         (HOST, 200),
+        (HOST + b"Accept-Encoding: gzip\r\n", 200),
         (HOST + b"Origin: http://evil.example\r\n", 403),
         (HOST + b"Origin: http://127.0.0.1\r\n" + b"Origin: http://evil.example\r\n", 403),
         (b"Host: evil.example\r\n", 403),
@@ -110,6 +108,7 @@ async def test_foreign_requests_are_answered_with_403(port: int) -> None:
         status, answered = await answer_to(port, b"GET / HTTP/1.1\r\n" + headers + b"\r\n")
         assert status == expected
         assert (answered.get("x-frame-options") == "DENY") == (status == 200)
+        assert answered.get("content-encoding") in (None, "identity")
 
 
 async def test_a_foreign_page_cannot_open_a_websocket(port: int) -> None:

@@ -1,4 +1,4 @@
-"""Test the page in Chromium without a graph: markup in names, stable layout, charts, frames."""
+"""Test the page in Chromium without a graph: markup in names, stable layout, frames."""
 
 from __future__ import annotations
 
@@ -21,31 +21,20 @@ from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.console.access_control import start_server
 from flexsheet.nodes.console.banner import GraphState
-from flexsheet.nodes.console.history import History
+from flexsheet.nodes.console.controller import Sliders
+from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.page import Page
-from flexsheet.nodes.console.state_file import Sliders
 from tests.arm_states import arm_state
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
-from tests.console_parts import FixedMessages, status_of
+from tests.console_parts import status_of
 from tests.fingertips import fingertip
 from tests.scenes import load_cylinder
-from tests.test_console_words import port
 from tests.waiting import DEADLINE_S
 
 pytestmark = BROWSER_MARKS
 
 MARKUP = '<img src=x onerror="window.ran=1"> **bold** [x](javascript:ran=1)'
 TABS = ("Touch", "Graph", "Eye", "Record")
-INKED_POINTS = """() => {
-    const canvas = document.querySelector(".uplot canvas");
-    const ratio = devicePixelRatio, {width, height} = canvas;
-    const data = canvas.getContext("2d").getImageData(0, 0, width, height).data;
-    let inked = 0;
-    for (let i = 0; i < data.length; i += 4)
-        if (data[i] < 90 && Math.abs(data[i + 1] - 133) < 50 && data[i + 2] > 130) inked += 1;
-    return inked / ratio;
-}"""
-"""Script that returns the number of chart pixels with about the first line's colour."""
 
 
 @dataclass
@@ -58,7 +47,6 @@ class PageVisit:
     options: list[str] = field(default_factory=list)
     slider_boxes: dict[str, Any] = field(default_factory=dict)
     stop_boxes: dict[str, Any] = field(default_factory=dict)
-    single_sample_ink: float = 0.0
     framed: dict[str, str | None] = field(default_factory=dict)
 
 
@@ -79,18 +67,13 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: PageVisit) 
     """Put HTML markup into every name and text that the page shows."""
     scene = load_cylinder().model_copy(update={"name": MARKUP})
     faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
-    page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.from_scene(scene))
+    page.touch.show_scene(MARKUP, scene, (MARKUP, "other"), Sliders.from_scene(scene))
     page.show_problem(MARKUP)
-    page.record.show_bags((f"{MARKUP}.mcap",))
     page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)
-    broken = status_of(
-        MARKUP, notes=(Note(detail=MARKUP),), errors=1, last_error=MARKUP, outputs=(port("stereo"),)
-    )
-    statuses = {MARKUP: (broken, 0.0)}
-    tables = panels.make_topics_table(statuses) + panels.make_nodes_table(statuses)
-    page.graph.show(tables, History().columns())
+    broken = status_of(MARKUP, notes=(Note(detail=MARKUP),), errors=1, last_error=MARKUP)
+    page.nodes.content = panels.make_nodes_table({MARKUP: (broken, 0.0)})
     # Shown last: what it says is there only once all else is.
-    page.show_state(GraphState(MARKUP, faulty, overload=MARKUP, solver_note=MARKUP, replay=MARKUP))
+    page.show_state(GraphState(MARKUP, faulty, overload=MARKUP, solver_note=MARKUP))
     await expect(tab.get_by_role("status")).to_contain_text(MARKUP)
     found.texts["banner"] = await tab.locator(".fs-state").inner_text()
     found.texts["problem"] = await tab.locator(".fs-problem").inner_text()
@@ -103,8 +86,6 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: PageVisit) 
             await tab.get_by_role("combobox", name="Scene").click()
             found.options.append(await tab.get_by_role("option").first.inner_text())
             await tab.keyboard.press("Tab")
-        if name == "Record":
-            found.options.append(await tab.get_by_role("combobox", name="Bag").input_value())
     found.ran.append(await tab.evaluate("() => window.ran"))
     page.show_problem("")
     await expect(tab.locator(".fs-problem")).to_have_count(0)
@@ -144,17 +125,6 @@ async def measure_layout(page: Page, tab: BrowserTab, found: PageVisit) -> None:
         found.stop_boxes[name] = await stop.bounding_box()
 
 
-async def draw_a_single_sample(page: Page, tab: BrowserTab, found: PageVisit) -> None:
-    history = History()
-    history.add(0.0, FixedMessages(fingertip=fingertip(np.zeros(3))))
-    page.graph.show("<p id=single>single</p>", history.columns())
-    await tab.get_by_role("tab", name="Graph").click()
-    await expect(tab.locator("#single")).to_be_visible()
-    for _ in range(3):
-        await tab.evaluate(TWO_FRAMES)
-    found.single_sample_ink = await tab.evaluate(INKED_POINTS)
-
-
 class FramingPage(BaseHTTPRequestHandler):
     """A page of another site that shows the console in a frame."""
 
@@ -192,7 +162,8 @@ async def open_in_frames(url: str, tab: BrowserTab, found: PageVisit) -> None:
 async def visit() -> PageVisit:
     found = PageVisit()
     server = start_server(0, "flexsheet")
-    page = Page(server, lambda *_: None, with_finger=True, others_may=(MARKUP,))
+    facts = GraphFacts(others_may_reset=(MARKUP,), simulates_finger=True)
+    page = Page(server, lambda *_: None, facts)
     url = f"http://127.0.0.1:{server.get_port()}/"
     try:
         async with browser_tab() as tab:
@@ -201,7 +172,6 @@ async def visit() -> PageVisit:
             found.title = await tab.title()
             await show_names_with_markup(page, tab, found)
             await measure_layout(page, tab, found)
-            await draw_a_single_sample(page, tab, found)
             await open_in_frames(url, tab, found)
     finally:
         await asyncio.to_thread(server.stop)
@@ -219,8 +189,8 @@ def test_the_browser_shows_the_title_of_the_console(found: PageVisit) -> None:
 
 def test_markup_in_names_is_shown_as_text_and_not_run(found: PageVisit) -> None:
     assert found.ran == [None] * (len(TABS) + 1)
-    assert found.options == [MARKUP, f"{MARKUP}.mcap"]
-    assert found.texts["banner"].count(MARKUP) >= 5
+    assert found.options == [MARKUP]
+    assert found.texts["banner"].count(MARKUP) >= 4
     assert MARKUP in found.texts["problem"]
     assert found.texts["Graph"].count(MARKUP) >= 3
     assert found.texts["Record"].count(MARKUP) >= 2
@@ -233,10 +203,6 @@ def test_nothing_moves_while_texts_change(found: PageVisit) -> None:
     assert len({str(box) for box in found.slider_boxes.values()}) == 1, found.slider_boxes
     assert len(found.stop_boxes) == 5
     assert len({str(box) for box in found.stop_boxes.values()}) == 1, found.stop_boxes
-
-
-def test_a_single_sample_is_a_point_of_the_chart(found: PageVisit) -> None:
-    assert found.single_sample_ink > 4
 
 
 def test_the_console_is_not_shown_in_a_frame(found: PageVisit) -> None:

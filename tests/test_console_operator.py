@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +13,12 @@ import pytest
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.notes import Note
-from flexsheet.messages.types import Display, FingerPath, Recording
+from flexsheet.messages.types import Bookmark, Display, FingerPath, Recording
 from flexsheet.nodes.console.access_control import start_server
 from flexsheet.nodes.console.controller import (
     MAX_DRAWING_S,
     SETTLE_S,
     ConsoleController,
-    ConsoleFiles,
     EyeViewState,
 )
 from flexsheet.nodes.console.finger import FingerController
@@ -40,7 +38,6 @@ class Bench:
     """A page without a viewer, and the messages that its node has sent."""
 
     operator: Operator
-    bags: Path
     sent: list[Message] = field(default_factory=list)
     now_s: float = 0.0
 
@@ -48,17 +45,12 @@ class Bench:
     def touch(self) -> Any:
         return self.operator._page.touch
 
-    @property
-    def bag(self) -> Any:
-        return self.operator._page.record._bag
-
     def run(self, seconds: float = 20.0) -> None:
         """Advance the time in steps of the node's period."""
         end_s = self.now_s + seconds
         while self.now_s < end_s:
             self.now_s += TICK_S
             self.operator.advance(self.now_s, has_viewers=True)
-        self.operator.refresh_tables(self.now_s)
 
     async def change_scene(self, name: str, value: float) -> None:
         """Move a slider of the scene, and wait until the new object is ready."""
@@ -92,20 +84,16 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     (tmp_path / "plan.json").write_text(
         json.dumps({"scene": json.loads(load_cylinder().model_dump_json())})
     )
-    files = ConsoleFiles(
-        tmp_path / "plan.json", tmp_path, tmp_path / "bags", tmp_path / "kept.json"
-    )
-    files.bags.mkdir()
     sent: list[Message] = []
     server = start_server(0, "test")
-    finger = FingerController(sent.append, speed_m_per_s=0.15)
-    facts = GraphFacts(recorders=("tape",), records_on_request=True, solvers=("body",))
-    controller = ConsoleController(sent.append, files, finger, pytest.fail, facts)
-    newest = LatestMessages(lambda topic, error: pytest.fail(str(error)))
-    operator = Operator(
-        server, newest, controller, pytest.fail, name="page", with_finger=True, with_eye=False
+    finger = FingerController(sent.append)
+    facts = GraphFacts(
+        recorders=("tape",), records_on_request=True, solvers=("body",), simulates_finger=True
     )
-    bench = Bench(operator, files.bags, sent)
+    controller = ConsoleController(sent.append, tmp_path / "plan.json", finger, facts)
+    newest = LatestMessages(lambda topic, error: pytest.fail(str(error)))
+    operator = Operator(server, newest, controller, pytest.fail, name="page", with_eye=False)
+    bench = Bench(operator, sent)
     await bench.know_object()
     yield bench
     await controller.scenes.close()
@@ -156,23 +144,18 @@ async def test_after_a_rejected_command_the_page_shows_what_holds(bench: Bench) 
     assert bench.touch._depth.value == 6.0
 
 
-async def test_the_bag_that_was_recorded_is_chosen(bench: Bench) -> None:
-    old = bench.bags / "old.mcap"
-    old.write_bytes(b"")
-    bench.run(1.0)
-    assert bench.bag.value == "old.mcap"
+async def test_the_record_button_starts_and_stops_the_recorder(bench: Bench) -> None:
+    record = bench.operator._page.record
+    bench.operator.handle_request("bookmark", "too early")
+    assert "start recording first" in bench.operator._page._problem.content
+    assert not bench.sent
     bench.operator.handle_request("record")
-    assert bench.sent[-1] == Recording(running=True)
-    bench.run(10.0)
+    bench.operator.handle_request("bookmark", "touch")
+    assert bench.sent == [Recording(running=True), Bookmark(label="touch")]
+    assert record._record.label == "Stop recording"
     bench.operator.handle_request("record")
-    assert bench.bag.value == "old.mcap", "the recorder has not made its bag yet"
-    (bench.bags / "new.mcap").write_bytes(b"")
-    os.utime(old)
-    bench.run(1.0)
-    assert bench.bag.value == "new.mcap"
-    bench.bag.value = "old.mcap"
-    bench.run(10.0)
-    assert bench.bag.value == "old.mcap", "what a viewer chose stays chosen"
+    assert bench.sent[-1] == Recording(running=False)
+    assert record._record.label == "Start recording"
 
 
 def display(label: str) -> Display:

@@ -22,14 +22,13 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.runs import Run, local_sources
 from flexsheet.launch.running.supervisor import RunningGraph
-from flexsheet.messages.bag import BagReader, BagWriter
+from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import Bookmark, EStop, FingerPath, Recording, TwinFinger
 from flexsheet.nodes.node import PortCounts
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
-from tests.fingertips import fingertip
 from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -139,7 +138,7 @@ async def visit(page: Page, session: PageVisit, port: int) -> None:
     await change_the_scene(page, session.inbox)
     await stop_and_release(page, session.inbox)
     await page.get_by_role("tab", name="Graph").click()
-    await expect(page.get_by_role("table", name="Topics")).to_contain_text("twin/finger_path")
+    await expect(page.get_by_role("table", name="Nodes")).to_contain_text("twin_finger")
     session.notes["nodes"] = await page.get_by_role("table", name="Nodes").inner_text()
     await end_recording(page, session.inbox)
 
@@ -150,7 +149,6 @@ async def begin_recording(page: Page, inbox: ReceivedMessages) -> None:
     await expect(page.get_by_role("button", name="Add a bookmark")).to_be_visible()
     await page.get_by_role("button", name="Add a bookmark").click()
     await expect(page.get_by_role("alert").last).to_contain_text("start recording")
-    await expect(page.get_by_role("combobox", name="Bag")).to_have_value("older.mcap")
     await page.get_by_role("button", name="Start recording").click()
     await inbox.until(lambda: inbox.last("recording") == Recording(running=True), "recording")
     await page.get_by_role("textbox", name="Name").fill("first touch")
@@ -232,11 +230,6 @@ async def end_recording(page: Page, inbox: ReceivedMessages) -> None:
     await page.get_by_role("tab", name="Record").click()
     await page.get_by_role("button", name="Stop recording").click()
     await inbox.until(lambda: inbox.last("recording") == Recording(running=False), "its end")
-    await expect(page.get_by_role("combobox", name="Bag")).to_have_value("a.mcap")
-    await page.get_by_role("button", name="Show the bag").click()
-    await expect(page.get_by_role("alert").last).to_contain_text(
-        "contains no topic that the page shows"
-    )
 
 
 def height_m(inbox: ReceivedMessages) -> float:
@@ -280,12 +273,8 @@ async def run_session(folder: Path) -> PageVisit:
         f"    parameters: {{bag: {folder}/bags/a.mcap, start_paused: true}}\n"
     )
     (folder / "bags").mkdir()
-    with BagWriter(folder / "bags" / "older.mcap") as writer:
-        header = Header(1, 1, 1, "clock", "triangulator", 1)
-        writer.write(find_topic("fingertip"), fingertip(np.zeros(3)), header, 1)
     port = free_port()
-    settings = [f"console.page_port={port}", f"console.bags={folder}/bags"]
-    plan = load_graph(file, console=True, settings=settings)
+    plan = load_graph(file, console=True, settings=[f"console.page_port={port}"])
     names = ("scene", "twin/finger_path", "twin/finger", "estop", "recording", "bookmark")
     async with async_playwright() as play:
         async with RunningGraph(plan) as graph:

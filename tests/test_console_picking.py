@@ -18,7 +18,7 @@ from flexsheet.messages.types import (
     FingerPath,
 )
 from flexsheet.nodes.console.controller import SceneController
-from flexsheet.nodes.console.finger import FingerController, FingerIntent, Ray
+from flexsheet.nodes.console.finger import SPEED_M_PER_S, FingerController, FingerIntent, Ray
 from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import make_shape
@@ -28,6 +28,7 @@ from tests.scenes import load_cylinder
 from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
+STEP_M = 0.005
 
 
 AIMS = [
@@ -53,7 +54,7 @@ def test_the_mouse_means_a_point_below_the_surface_or_beside_it(scene: Scene) ->
     for towards in (forward, grazing):
         hover = picker.pick(eye, towards, -HOVER_M)
         assert depth_m(scene, hover) == pytest.approx(-HOVER_M, abs=2e-4)
-    finger = FingerController(lambda message: None, speed_m_per_s=0.1)
+    finger = FingerController(lambda message: None)
     for bad in (np.zeros(3), np.array([np.nan, 0, 1])):
         with pytest.raises(ValueError, match="direction"):
             finger.touch(eye, bad)
@@ -61,7 +62,7 @@ def test_the_mouse_means_a_point_below_the_surface_or_beside_it(scene: Scene) ->
 
 def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> None:
     picker, sent = SurfacePicker(scene), []
-    finger = FingerController(sent.append, speed_m_per_s=0.1)
+    finger = FingerController(sent.append)
     finger.use(picker)
     finger.push(0.003)
     finger.move_to(0.0, -0.04)
@@ -91,12 +92,12 @@ def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
     """
     for _ in range(200):
         count = len(sent)
-        finger.advance(0.05, None)
+        finger.advance(STEP_M / SPEED_M_PER_S, None)
         if len(sent) == count:
             break
     points = np.array([path.positions_world_m[0] for path in sent])
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    assert steps.max(initial=0.0) <= 0.1 * 0.05 + 1e-9
+    assert steps.max(initial=0.0) <= STEP_M + 1e-9
     return np.asarray(points[-1])
 
 
@@ -109,7 +110,7 @@ def depth_m(scene: Scene, point: Floats) -> float:
 def test_a_drag_beside_the_object_stays_on_its_touchable_surface(scene: Scene) -> None:
     """Earlier, a drag beside the end of the cylinder moved the finger behind the sheet."""
     sent: list[FingerPath] = []
-    finger = FingerController(sent.append, speed_m_per_s=0.1)
+    finger = FingerController(sent.append)
     finger.use(SurfacePicker(scene))
     geometry, solid = scene.object.geometry, scene.object
     assert isinstance(geometry, Cylinder)
@@ -166,17 +167,19 @@ def test_a_push_deeper_than_the_working_range_is_refused(scene: Scene) -> None:
     picker = SurfacePicker(scene)
     eye, forward = np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, -1.0])
     np.testing.assert_allclose(picker.pick(eye, forward, 0.2), [0.0, 0.0, -0.05], atol=2e-4)
-    finger = FingerController(lambda message: None, speed_m_per_s=0.1)
+    sent: list[Message] = []
+    finger = FingerController(sent.append)
     finger.use(picker)
     with pytest.raises(ValueError, match="60 mm is deeper than the working range of the scene, 50"):
         finger.push(0.06)
-    assert not finger.commanded
+    finger.advance(0.05, None)
+    assert not sent
 
 
 def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:
     """Earlier, a new scene or lifting the finger reset the push depth."""
     sent: list[FingerPath] = []
-    finger = FingerController(sent.append, speed_m_per_s=0.1)
+    finger = FingerController(sent.append)
     finger.use(SurfacePicker(scene))
     finger.advance(0.05, None)
     assert not sent, "nobody has moved it yet"
@@ -216,7 +219,7 @@ commands = st.one_of(
 def test_the_finger_depends_only_on_the_present_request(
     steps: list[tuple[Any, ...]],
 ) -> None:
-    finger = FingerController(lambda message: None, speed_m_per_s=1.0)
+    finger = FingerController(lambda message: None)
     finger.use(AIMS[0])
     picker, depth, position, lifted = AIMS[0], 0.004, (0.0, 0.0), True
     commanded = False
@@ -244,7 +247,7 @@ def test_the_finger_depends_only_on_the_present_request(
 
 
 def test_a_finger_that_cannot_be_moved_has_a_reason(scene: Scene) -> None:
-    finger = FingerController(lambda message: None, speed_m_per_s=0.1)
+    finger = FingerController(lambda message: None)
     finger.use(SurfacePicker(scene))
     for depth in (-0.001, np.nan, np.inf):
         with pytest.raises(ValueError, match="finite number"):
@@ -256,13 +259,14 @@ async def test_an_object_is_made_ready_to_point_at_beside_the_loop(
 ) -> None:
     sent: list[Message] = []
     controller = SceneController(sent.append, tmp_path, scene)
-    finger, failures = FingerController(sent.append, speed_m_per_s=1.0), []
+    finger, failures = FingerController(sent.append), []
     controller.make_picker(finger, failures.append)
     finger.push(0.002)
-    assert not finger.advance(1.0, None), "its shape is not known yet"
+    finger.advance(1.0, None)
+    assert not sent, "its shape is not known yet"
     async with asyncio.timeout(DEADLINE_S):
-        while not finger.advance(1.0, None):  # noqa: ASYNC110  # it is told by a task
+        while not sent:  # it is told by a task
             await asyncio.sleep(0)
+            finger.advance(1.0, None)
     await controller.close()
-    assert sent
     assert not failures

@@ -34,12 +34,7 @@ def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
     assert plan.nodes["console"].nice > 0
     assert plan.nodes["console"].parameters["page_port"] == 8123
     assert plan.listening_nodes(None) == [("console", 8123)]
-    assert plan.nodes["console"].parameters["control_finger"]
     assert plan.nodes["recorder"].parameters["start_paused"]
-    # In the run's directory NAME.json is what the launcher tells the node of that name.
-    assert plan.nodes["console"].parameters["state_file"].removeprefix("@run/") not in {
-        f"{name}.json" for name in plan.nodes
-    }
     read = {port.topic for port in plan.nodes["console"].inputs}
     assert {"status", "estop", "display"} <= read
     assert "arm_left" not in read, "which nobody writes here"
@@ -66,7 +61,7 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
         file.write_text(load_graph(graph, **options).model_dump_json())
         return GraphFacts.from_plan(file, "console")
 
-    on_request = GraphFacts(recorders=("recorder",), records_on_request=True, consoles=("console",))
+    on_request = GraphFacts(recorders=("recorder",), records_on_request=True, simulates_finger=True)
     assert facts(console=True) == on_request
     always = facts(console=True, record=tmp_path / "a.mcap")
     assert always == replace(on_request, records_on_request=False)

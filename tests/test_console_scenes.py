@@ -21,12 +21,10 @@ from flexsheet.nodes.console import scenes
 from flexsheet.nodes.console.controller import (
     SETTLE_S,
     ConsoleController,
-    ConsoleFiles,
     SceneController,
 )
-from flexsheet.nodes.console.finger import FingerController, FingerIntent
+from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.picking import SurfacePicker
-from flexsheet.nodes.console.state_file import ConsoleState, Sliders, load_state, save_state
 from tests.console_parts import ROOT
 from tests.plans import scene_with
 from tests.scenes import load_cylinder
@@ -119,55 +117,37 @@ async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path)
     assert len(sent) == 2
 
 
-def test_the_sliders_of_a_rigid_object_are_saved(scene: Scene, tmp_path: Path) -> None:
-    rigid = scene.model_copy(update={"object": scene.object.model_copy(update={"material": None})})
-    state = ConsoleState(base=rigid, sliders=Sliders.from_scene(rigid))
-    save_state(tmp_path / "state.json", state)
-    loaded = load_state(tmp_path / "state.json")
-    assert loaded is not None
-    assert loaded.sliders == state.sliders
-
-
 def test_a_restarted_console_restores_its_state(scene: Scene, tmp_path: Path) -> None:
-    (tmp_path / "plan.json").write_text(f'{{"scene": {scene.model_dump_json()}}}')
-    other = scene.model_copy(update={"name": "other"})
+    plan_file = tmp_path / "plan.json"
+    plan_file.write_text(f'{{"scene": {scene.model_dump_json()}}}')
+    rigid = scene.object.model_copy(update={"material": None})
     (tmp_path / "scenes").mkdir()
-    (tmp_path / "scenes" / "other.json").write_text(other.model_dump_json())
-    files = ConsoleFiles(
-        tmp_path / "plan.json", tmp_path / "scenes", tmp_path, tmp_path / "console.json"
-    )
-    warnings: list[str] = []
+    for name, solid in (("other", scene.object), ("rigid", rigid)):
+        other = scene.model_copy(update={"name": name, "object": solid})
+        (tmp_path / "scenes" / f"{name}.json").write_text(other.model_dump_json())
 
     def controller() -> tuple[ConsoleController, list[Message]]:
         sent: list[Message] = []
-        made = ConsoleController(
-            sent.append, files, FingerController(sent.append, speed_m_per_s=0.1), warnings.append
-        )
+        made = ConsoleController(sent.append, plan_file, FingerController(sent.append))
         made.begin()
+        made.finger.use(SurfacePicker(made.scenes.scene))
+        made.finger.advance(1.0, None)
         return made, sent
 
     first, sent = controller()
     assert [one.name for one in sent if isinstance(one, Scene)] == [scene.name]
     first.scenes.choose("other")
-    first.scenes.slide(1.0, young_modulus_pa=9e3)
+    first.scenes.slide(1.0, young_modulus_pa=9e3, size_ratio=1.2)
     first.scenes.apply_sliders(2.0)
-    first.finger.push(0.009)
     first.record(True)
     again, sent = controller()
-    assert again.finger.intent == FingerIntent(depth_m=0.009, lifted=False)
-    assert again.scenes.sliders == first.scenes.sliders
     taken_up, recording = sent
     assert isinstance(taken_up, Scene)
-    assert (taken_up.name, taken_up.object.material.young_modulus_pa) == ("other", 9e3)
+    assert taken_up.model_dump_json() == first.scenes.scene.model_dump_json()
+    assert (again.scenes.sliders.young_modulus_pa, again.scenes.sliders.size_ratio) == (9e3, 1.0)
     assert recording == Recording(running=True)
     again.record(False)
-    again.scenes.choose("other")
+    again.scenes.choose("rigid")
     third, sent = controller()
-    assert [type(message) for message in sent] == [Scene], "nothing is being recorded"
-    assert third.scenes.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
-    assert warnings == []
-    files.state.write_text("{")
-    (begun,) = controller()[1]
-    assert isinstance(begun, Scene)
-    assert begun.name == scene.name
-    assert "the saved state is invalid" in warnings[0]
+    assert [type(message) for message in sent] == [Scene], "nothing is recorded or moved"
+    assert third.scenes.sliders.young_modulus_pa is None

@@ -45,7 +45,7 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.shipped import LAUNCH_FILES
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.nodes import NODES, node_class
-from flexsheet.nodes.console.html_head import HERE
+from flexsheet.nodes.console.access_control import HERE
 from flexsheet.nodes.renderer.gl import shader_text
 
 PATTERNS = {"launch": "*.yaml", "scene": "scenes/*", "calibration": "calibrations/*",

@@ -27,7 +27,7 @@ from flexsheet.messages.security import make_key_pair, write_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Arming, EStop
 from flexsheet.nodes import node_class
-from flexsheet.nodes.console.controller import ConsoleController, ConsoleFiles, ReleaseError
+from flexsheet.nodes.console.controller import ConsoleController, ReleaseError
 from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.node import Node, NodeParameters, Output, find_parameters_type
@@ -230,10 +230,9 @@ def test_a_console_that_may_not_reset_names_hosts_that_may(folder: Path, may: bo
     plan = lab(folder, may_reset_estop=may)
     (folder / "plan.json").write_text(plan.model_dump_json())
     sent: list[Message] = []
-    files = ConsoleFiles(folder / "plan.json", folder, folder, folder / "console.json")
-    facts = GraphFacts.from_plan(files.plan, "console")
-    finger = FingerController(sent.append, speed_m_per_s=0.1)
-    console = ConsoleController(sent.append, files, finger, print, facts)
+    facts = GraphFacts.from_plan(folder / "plan.json", "console")
+    finger = FingerController(sent.append)
+    console = ConsoleController(sent.append, folder / "plan.json", finger, facts)
     console.stop("pressed at the console")
     if may:
         console.release()

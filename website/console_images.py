@@ -1,8 +1,8 @@
 """Make the images of the console in docs/images: `python -m website.console_images`.
 
 A graph with the simulator records a finger that strokes the object and pushes it.  The animation is
-drawn from that bag, frame by frame, so it does not depend on the speed of the computer.  The images
-of the page show the console of a running graph.  Chromium is needed.
+drawn from that bag, frame by frame, so it does not depend on the speed of the computer.  The image
+of the page shows the console of a running graph.  Chromium is needed.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.messages.types import FingerPath, Skin
-from flexsheet.nodes.console.replay import Timeline
+from flexsheet.messages.wire import encode
+from flexsheet.nodes.console.latest_messages import LatestMessages
 from flexsheet.nodes.console.scene_view import SceneView
-from flexsheet.nodes.console.snapshot import compute_snapshot
 from flexsheet.nodes.models.rigid import apply
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -48,6 +48,7 @@ WITHOUT_GPU = (
 DEADLINE_MS = 180_000.0
 
 PATH_LABEL = "stroke and push"
+TOPICS = ("scene", "skin", "soft_body", "fingertip", "arm_left", "arm_right")
 KNOTS = (
     # time (s), along the axis (m), angle from the front (rad), depth (m)
     (0.0, -0.02, 0.0, 0.012),
@@ -101,23 +102,14 @@ def record(bag: Path) -> None:
     run_experiment(DEMO, (), bag, procedure, print)
 
 
-def start_of_last_pass_s(bag: Path) -> float:
-    """Return the time in the bag at which the last pass of the finger begins."""
-    reader = BagReader(bag)
-    times_ns = [time_ns for _, _, _, time_ns in BagReader(bag, topics=["twin/finger_path"])]
-    return (times_ns[-1] - reader.info().start_ns) * 1e-9
-
-
 @asynccontextmanager
-async def open_page(url: str, size_px: tuple[int, int], *, dark: bool) -> AsyncIterator[Page]:
+async def open_page(url: str, size_px: tuple[int, int]) -> AsyncIterator[Page]:
     async with async_playwright() as play:
         chromium = await play.chromium.launch(
             executable_path=str(CHROMIUM), args=list(WITHOUT_GPU), timeout=DEADLINE_MS
         )
         width, height = size_px
-        page = await chromium.new_page(
-            viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light"
-        )
+        page = await chromium.new_page(viewport={"width": width, "height": height})
         page.set_default_timeout(DEADLINE_MS)
         await page.goto(url)
         yield page
@@ -126,10 +118,18 @@ async def open_page(url: str, size_px: tuple[int, int], *, dark: bool) -> AsyncI
 
 async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) -> None:
     """Draw the last pass of the finger in a bag as an animated WebP."""
-    timeline = Timeline(bag)
-    start_s = start_of_last_pass_s(bag)
-    timeline.seconds = start_s
-    scene, skin = timeline.latest("scene", Scene), timeline.latest("skin", Skin)
+    *_, start_ns = (time_ns for *_, time_ns in BagReader(bag, topics=["twin/finger_path"]))
+    entries = iter(BagReader(bag, topics=TOPICS))
+    messages = LatestMessages(lambda topic, error: print(topic.name, error))
+
+    def read_until(end_ns: float) -> None:
+        for topic, message, header, time_ns in entries:
+            messages.put(topic, encode(message, header))
+            if time_ns >= end_ns:
+                break
+
+    read_until(start_ns)
+    scene, skin = messages.latest("scene", Scene), messages.latest("skin", Skin)
     assert scene is not None
     assert skin is not None
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -142,18 +142,18 @@ async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) 
 
     view = SceneView(server, lambda *_: None)
     view.set_scene(scene[0])
-    view.set_skin(np.asarray(skin[0].vertices_world_m, dtype=np.float64), skin[0].triangles)
+    view.set_skin(skin[0])
     url = f"http://127.0.0.1:{server.get_port()}/"
     frames = []
-    async with open_page(url, SIZE_PX, dark=False):
+    async with open_page(url, SIZE_PX):
         client = await joined
         client.camera.position, client.camera.look_at = POSITION_M, TARGET_M
         client.camera.up_direction, client.camera.fov = (0.0, 1.0, 0.0), FOV_RAD
         times_s = np.arange(0.0, PATH_S, 1.0 / frames_per_s)
         # The page loads meshes and fonts while it draws the first frames.
-        for seconds in (*times_s[:WARM_UP_FRAMES], *times_s):
-            timeline.seconds = start_s + float(seconds)
-            view.draw(compute_snapshot(scene[0], timeline))
+        for seconds in (*np.zeros(WARM_UP_FRAMES), *times_s):
+            read_until(start_ns + 1e9 * seconds)
+            view.draw(scene[0], messages)
             drawn = await asyncio.to_thread(
                 client.get_render, SIZE_PX[1], SIZE_PX[0], transport_format="png"
             )
@@ -185,32 +185,21 @@ async def slide(page: Page, label: str, value: float) -> None:
     await box.press("Enter")
 
 
-async def photograph(bag: Path) -> None:
-    """Save images of the page of a running graph: tab Touch, a replay, and tab Graph when dark."""
+async def photograph() -> None:
+    """Save an image of the page of a running graph."""
     # The page needs most of the processor time of a computer without a graphics card.
-    settings = [f"console.bags={bag.parent}", "fem_solver.method=linear"]
-    plan = load_graph(DEMO, settings=settings, console=True)
+    plan = load_graph(DEMO, settings=["fem_solver.method=linear"], console=True)
     precompute_graph(plan, print)
     url = f"http://127.0.0.1:{plan.nodes['console'].parameters['page_port']}/"
     expect.set_options(timeout=DEADLINE_MS)
     async with RunningGraph(plan, without=("renderer",)) as graph:
         await graph.wait_ready(DEADLINE_MS / 1e3)
-        async with open_page(url, PAGE_PX, dark=False) as page:
+        async with open_page(url, PAGE_PX) as page:
             await dismiss_notice(page)
             await slide(page, "Push, mm", 12)
             await expect(page.get_by_role("status")).to_contain_text("following")
             await expect(page.get_by_text("pushes 1")).to_be_visible()
             await page.screenshot(path=IMAGES / "console.png")
-            await page.get_by_role("tab", name="Record").click()
-            await page.get_by_role("button", name="Show the bag").click()
-            await slide(page, "Time, s", 12)
-            await page.screenshot(path=IMAGES / "console-replay.png")
-            await page.get_by_role("button", name="Back to the running graph").click()
-        async with open_page(f"{url}?darkMode", PAGE_PX, dark=True) as page:
-            await dismiss_notice(page)
-            await page.get_by_role("tab", name="Graph").click()
-            await expect(page.get_by_role("table", name="Topics")).to_contain_text("sheet_target")
-            await page.screenshot(path=IMAGES / "console-dark.png")
 
 
 async def dismiss_notice(page: Page) -> None:
@@ -224,7 +213,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bag", type=Path, help="bag of an earlier run of this command")
     parser.add_argument("--animation", action="store_true", help="make the animation only")
-    parser.add_argument("--page", action="store_true", help="make the images of the page only")
+    parser.add_argument("--page", action="store_true", help="make the image of the page only")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
         bag = given.bag or Path(folder) / "touch.mcap"
@@ -233,7 +222,7 @@ def main() -> None:
         if not given.page:
             asyncio.run(animate(bag, IMAGES / "console.webp"))
         if not given.animation:
-            asyncio.run(photograph(bag))
+            asyncio.run(photograph())
 
 
 if __name__ == "__main__":

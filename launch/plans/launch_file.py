@@ -296,10 +296,7 @@ def apply_console(document: Document) -> None:
     specs = [one for one in nodes.values() if isinstance(one, dict)] if nodes else []
     roles = {_find_role(spec.get("type")) for spec in specs}
     if NodeRole.CONSOLE not in roles:
-        added: dict[str, Any] = {"type": "console", "nice": CONSOLE_NICE}
-        if NodeRole.FINGER_SIMULATOR not in roles:
-            added["parameters"] = {"control_finger": False}
-        document.set(("nodes", "console"), added, origin)
+        document.set(("nodes", "console"), {"type": "console", "nice": CONSOLE_NICE}, origin)
     if NodeRole.RECORDER not in roles and "record" not in document.values:
         parameters = {"bag": str(RECORDINGS.absolute()), "start_paused": True}
         recorder = {"type": "recorder", "nice": RECORDER_NICE, "parameters": parameters}

@@ -10,6 +10,7 @@ import io
 import socket
 from contextlib import redirect_stdout
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -18,7 +19,6 @@ import websockets.asyncio.server
 from websockets.http11 import Request, Response
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.console.html_head import inject_assets
 
 ADDRESS = "127.0.0.1"
 OWN_NAMES = (ADDRESS, "::1", "localhost")
@@ -26,6 +26,9 @@ OWN_NAMES = (ADDRESS, "::1", "localhost")
 
 The web site of an attacker could make its own name resolve to this computer (DNS rebinding).
 """
+
+
+HERE = Path(__file__).resolve().parent
 
 
 class ConsoleError(FlexsheetError, RuntimeError):
@@ -48,6 +51,24 @@ def is_allowed(request: Request) -> bool:
         return False
 
 
+def inject_assets(response: Response) -> Response:
+    """Add page.css and page.js to the head of an HTML page; return other responses unchanged.
+
+    viser's page has sliders without names, folders that cannot be opened by keyboard, and labels
+    with too little contrast. If the connection is lost, it shows only a red dot.
+    """
+    if not response.headers.get("Content-Type", "").startswith("text/html"):
+        return response
+    style, script = ((HERE / name).read_bytes() for name in ("page.css", "page.js"))
+    ours = b"<style>" + style + b"</style><script>" + script + b"</script></head>"
+    response.body = bytes(response.body).replace(b"</head>", ours)
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+    # In a frame, another page could hide the element that the user clicks.
+    response.headers["X-Frame-Options"] = "DENY"
+    return response
+
+
 def start_server(port: int, label: str) -> viser.ViserServer:
     """Start a viser server that checks each request.
 
@@ -65,6 +86,9 @@ def start_server(port: int, label: str) -> viser.ViserServer:
                 text = f"open the console at http://{ADDRESS}:{server.get_port()}/\n"
                 refusal: Response = connection.respond(HTTPStatus.FORBIDDEN, text)
                 return refusal
+            # The page is not compressed, so that it can be completed.
+            if "Accept-Encoding" in request.headers:
+                del request.headers["Accept-Encoding"]
             response = process_request(connection, request)
             return None if response is None else inject_assets(response)
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import RV_1A, ClosedFormArm, JointChain
 from flexsheet.nodes.arrays import Floats
@@ -48,9 +46,6 @@ PIECES = (
 
 LINK_WIDTH_M = 0.07
 """The width of the boxes that represent the links of all other arm models."""
-
-CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-"""The corners (8, 3) of a cube with coordinates from -1 to 1."""
 
 BRACKET_WIDTH_M = 0.012
 """The width of the drawn bar between a flange and its clamp."""
@@ -93,39 +88,3 @@ def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
         size_m = (abs(x) + LINK_WIDTH_M, abs(y) + LINK_WIDTH_M, abs(z) + LINK_WIDTH_M)
         pieces.append(Piece(link, size_m, (0.5 * x, 0.5 * y, 0.5 * z), dark=link % 2 == 0))
     return (*pieces, Piece(6, (0.05, 0.05, 0.02), (0.0, 0.0, -0.01), dark=True))
-
-
-def rounded_box(
-    size_m: tuple[float, float, float], centre_m: tuple[float, float, float], bevel: float = 0.18
-) -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices (24, 3), m, and triangles (44, 3) of a box with bevelled edges.
-
-    bevel: width of the bevel, divided by half of the shortest side.
-
-    The triangles are counter-clockwise as seen from outside.
-    """
-    half = 0.5 * np.array(size_m)
-    cut = bevel * half.min()
-    # Each corner has three vertices, one for each face.
-    vertices = np.concatenate(
-        [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
-    )
-    return make_hull(vertices + np.array(centre_m))
-
-
-def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return n vertices (n, 3), m, and t triangles (t, 3) of the bar between flange and clamp.
-
-    flange_from_clamp_m: centre (3,) of the clamp in the flange frame.
-    """
-    reach_m = np.abs(flange_from_clamp_m)
-    vertices, triangles = rounded_box(
-        tuple((BRACKET_WIDTH_M + reach_m).tolist()), tuple(0.5 * flange_from_clamp_m)
-    )
-    return vertices.astype(np.float32), triangles
-
-
-def make_hull(points: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Return the convex hull of n points (n, 3) as k vertices (k, 3) and t triangles (t, 3)."""
-    hull = trimesh.convex.convex_hull(points)
-    return np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int32)

@@ -1,6 +1,4 @@
-"""Render the banner of the console page. It shows the state of the arms, what the user must do, and
-the source of the displayed data.
-"""
+"""Render the banner of the console page: the state of the arms, and what the user must do."""
 
 from __future__ import annotations
 
@@ -50,7 +48,6 @@ class GraphState:
     sheet: newest sheet target; None before the first target.
     overload: sentence about an overloaded computer; empty if no computer is overloaded.
     solver_note: note of the soft-body solver; empty if the solver has a result for the scene.
-    replay: name of the replayed bag; None if no bag is replayed.
     """
 
     scene: str
@@ -59,7 +56,6 @@ class GraphState:
     sheet: SheetTarget | None = None
     overload: str = ""
     solver_note: str = ""
-    replay: str | None = None
 
     @property
     def stopped(self) -> str | None:
@@ -101,14 +97,8 @@ def render(state: GraphState) -> str:
         sentences.append(f"The edge force is {max(forces):.1f} N.")
     if state.solver_note:
         sentences.append(f"The object is not shown yet. Its solver reports: {state.solver_note}.")
-    scene = f"<b>{escape(state.scene)}</b>"
-    source = f"Scene {scene}, live."
-    if state.replay is not None:
-        source = (
-            f"<b>REPLAY</b> of {escape(state.replay)}, scene {scene}: the 3D view shows the bag, "
-            "and this window shows the running graph."
-        )
-    text = " ".join([source, *(escape(one) for one in sentences if one)])
+    scene = f"Scene <b>{escape(state.scene)}</b>."
+    text = " ".join([scene, *(escape(one) for one in sentences if one)])
     return (
         '<div class="fs-state" tabindex="0" role="group" aria-label="State of the arms">'
         f'<div role="status" aria-live="polite" data-state="{shown.name.lower()}" '

@@ -7,24 +7,22 @@ from the projected frame by ray tracing.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from enum import Enum, auto
 from pathlib import Path
 
-import numpy as np
+from pydantic import BaseModel
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
+from flexsheet.messages.types import Bookmark, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
 from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.picking import SurfacePicker
-from flexsheet.nodes.console.replay import Timeline, list_bags
-from flexsheet.nodes.console.state_file import ConsoleState, Sliders, load_state, save_state
 
 Publish = Callable[[Message], None]
 
@@ -43,40 +41,53 @@ MAX_TRACING_S = 120.0
 """The maximum time (s) to wait for the ray-traced image of the eye view."""
 
 DEFAULT_BOOKMARK = "bookmark"
-MAX_LABELS = 64
-"""The number of the newest requests whose images are shown even if they arrive late."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sliders:
+    """The positions of the sliders on the console page.
+
+    young_modulus_pa: Young's modulus of the object; None if the object is rigid.
+    stretch_ratio: minimum stretch ratio of the sheet.
+    size_ratio: size of the object, relative to its size in the selected scene.
+    """
+
+    young_modulus_pa: float | None
+    stretch_ratio: float
+    size_ratio: float
+
+    @staticmethod
+    def from_scene(scene: Scene) -> Sliders:
+        """Return the slider positions that correspond to an unchanged scene."""
+        material = scene.object.material
+        return Sliders(
+            None if material is None else material.young_modulus_pa,
+            max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
+            1.0,
+        )
 
 
 class SceneController:
     """A controller that selects and changes the scene of the graph when viewers request it."""
 
-    def __init__(
-        self,
-        publish: Callable[[Scene], None],
-        folder: Path,
-        first: Scene,
-        sliders: Sliders | None = None,
-    ) -> None:
+    def __init__(self, publish: Callable[[Scene], None], folder: Path, first: Scene) -> None:
         """Create the controller with the scene `first`.
 
         publish: function that publishes a scene.
         folder: folder with the selectable scenes.
-        sliders: slider positions that the previous console process saved; None if no slider was
-            moved.
         """
         self._publish, self._folder = publish, folder
         self.names = scenes.list_scene_names(folder)
-        self.base, self.moved = first, sliders is not None
-        self.sliders = sliders or Sliders.from_scene(first)
-        self.scene = self._edit_scene() if self.moved else first
+        self.base = self.scene = first
+        self.sliders = Sliders.from_scene(first)
         self._due_s: float | None = None
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
         """Choose another scene of the run; raise SceneChoiceError if the name is unknown."""
-        self.base, self.moved = scenes.load(self._folder, name), False
+        self.base = self.scene = scenes.load(self._folder, name)
         self.sliders = Sliders.from_scene(self.base)
-        self._send(self.base)
+        self._publish(self.scene)
 
     def slide(self, now_s: float, **changes: float) -> None:
         """Store new slider positions by name. `apply_sliders` changes the scene later.
@@ -94,20 +105,9 @@ class SceneController:
         if self._due_s is None or now_s < self._due_s:
             return False
         self._due_s = None
-        scene, self.moved = self._edit_scene(), True
-        self._send(scene)
-        return True
-
-    def _edit_scene(self) -> Scene:
-        return scenes.edit_scene(self.base, **asdict(self.sliders))
-
-    def _send(self, scene: Scene) -> None:
-        self.scene = scene
-        self._publish(scene)
-
-    def publish_current(self) -> None:
-        """Publish the current scene again."""
+        self.scene = scenes.edit_scene(self.base, **asdict(self.sliders))
         self._publish(self.scene)
+        return True
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
         """Create the picker, which converts mouse positions to points on the virtual object.
@@ -150,18 +150,16 @@ class EyeViewRequester:
     Only one view is requested at a time, because ray tracing is slow. For each view, the renderer
     draws one frame and publishes its pixels. From this frame, the simulated eye computes the view.
     Afterwards, the previous display settings are restored. If no other node has sent display
-    settings, the image correction of the scene or of the console is restored.
+    settings, the image correction of the scene is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
         self._publish = publish
         self.enabled = False
-        self.chosen_correction: Correction | None = None
         self.state = EyeViewState.RESTING
-        self._by_scene = scene.methods.correction
+        self._correction = scene.methods.correction
         self._owns_display = self._borrowed = False
         self._number = 0
-        self._labels: deque[str] = deque(maxlen=MAX_LABELS)
         self._since_s, self._next_s = 0.0, 0.0
         self._others_display: Display | None = None
 
@@ -169,11 +167,6 @@ class EyeViewRequester:
     def label(self) -> str:
         """Return the label of the newest request. The requested frame has the same label."""
         return f"console {self._number}"
-
-    @property
-    def correction(self) -> Correction:
-        """Return the image correction that a viewer has chosen, or that the scene specifies."""
-        return self.chosen_correction or self._by_scene
 
     def waited_s(self, now_s: float) -> float:
         """Return the time (s) since the state of the request last changed."""
@@ -185,7 +178,7 @@ class EyeViewRequester:
         If the console has sent display settings, the renderer ignores the correction in later
         scenes. In this case, this method publishes display settings with the new correction.
         """
-        self._by_scene = scene.methods.correction
+        self._correction = scene.methods.correction
         if self._owns_display and not self._borrowed:
             self._restore_display()
 
@@ -214,25 +207,17 @@ class EyeViewRequester:
 
     def _request(self, now_s: float) -> None:
         self._number += 1
-        self._labels.append(self.label)
         self._enter(EyeViewState.DRAWING, now_s)
         self._borrowed = True
         self._publish(
             Display(
-                correction=self.correction,
+                correction=self._correction,
                 stereo="mono",
                 marks=False,
                 pixels_every=PIXELS_EVERY,
                 label=self.label,
             )
         )
-
-    def request_now(self) -> None:
-        """Request the next eye view immediately.
-
-        Without this call, eye views are requested at intervals of EYE_VIEW_PERIOD_S.
-        """
-        self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:
         """Enter the state TRACING if a frame contains the pixels that this console requested.
@@ -242,14 +227,10 @@ class EyeViewRequester:
         if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
             self._enter(EyeViewState.TRACING, now_s)
 
-    def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """End the request that an image of the simulated eye answers.
-
-        Returns whether this console requested the image.
-        """
+    def on_image(self, eye: TwinEye, now_s: float) -> None:
+        """End the request if an image of the simulated eye answers it."""
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
-        return eye.label in self._labels
 
     def _enter(self, state: EyeViewState, now_s: float) -> None:
         self.state, self._since_s = state, now_s
@@ -262,68 +243,19 @@ class EyeViewRequester:
 
     def _restore_display(self) -> None:
         self._borrowed, self._owns_display = False, self._others_display is None
-        own = Display(correction=self.correction, stereo="side_by_side", label="console rests")
+        own = Display(correction=self._correction, stereo="side_by_side", label="console rests")
         self._publish(self._others_display or own)
 
 
-class Replay:
-    """The replay of a bag on the console page. A replay publishes no messages.
+class ConsoleState(BaseModel):
+    """The state with which a restarted console continues.
 
-    timeline: opened bag; None if no bag is open.
-    playing: whether the replay advances.
-    rate: ratio of recorded time to real time.
+    scene: newest published scene.
+    recording: whether a viewer has requested a recording.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.timeline: Timeline | None = None
-        self.playing = False
-        self.rate = 1.0
-
-    def bags(self) -> list[str]:
-        """Return the names of the bags in the folder, starting with the newest bag."""
-        return list_bags(self._folder)
-
-    def open(self, name: str) -> None:
-        """Open the bag `name` in the folder of bags, and play it from its start.
-
-        Raises BagError if the file is not a readable bag.
-        """
-        self.timeline = Timeline(self._folder / name)
-        self.playing = True
-
-    def leave(self) -> None:
-        """Close the replayed bag, and show the running graph again."""
-        self.timeline, self.playing = None, False
-
-    def seek(self, seconds: float) -> None:
-        """Move the replay to a time (s) since the start of the bag, at most the bag's duration."""
-        if self.timeline is not None:
-            self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
-
-    def play_or_pause(self) -> None:
-        """Pause or continue the replay; at the end of the bag, restart from the beginning."""
-        if self.timeline is not None and self.timeline.seconds >= self.timeline.duration_s:
-            self.seek(0.0)
-        self.playing = not self.playing
-
-    def advance(self, duration_s: float) -> None:
-        """Advance the replay by a period of real time (s), and stop at the end of the bag."""
-        if self.timeline is None or not self.playing:
-            return
-        self.seek(self.timeline.seconds + self.rate * duration_s)
-        if self.timeline.seconds >= self.timeline.duration_s:
-            self.playing = False
-
-
-@dataclass(frozen=True, slots=True)
-class ConsoleFiles:
-    """The file paths of a console: the run's plan, the scenes, the bags, and the saved state."""
-
-    plan: Path
-    scenes: Path
-    bags: Path
-    state: Path
+    scene: Scene
+    recording: bool = False
 
 
 class ReleaseError(FlexsheetError, ValueError):
@@ -341,30 +273,28 @@ class ReleaseError(FlexsheetError, ValueError):
 class ConsoleController:
     """The controller of the console, which publishes e-stops, recording requests and bookmarks.
 
-    warn: function that receives an error text if the saved state cannot be used.
+    plan_file: plan in the directory of the run, which also contains the scenes.
 
-    The state is saved. After a restart, the console continues with the saved scene, slider
-    positions, finger position and recording request.
+    After a restart, the console continues with the saved scene and recording request.
     """
 
     def __init__(
         self,
         publish: Publish,
-        files: ConsoleFiles,
+        plan_file: Path,
         finger: FingerController,
-        warn: Callable[[str], None],
         facts: GraphFacts | None = None,
     ) -> None:
-        self._files, self.facts = files, facts or GraphFacts()
-        state = load_first_state(files, warn)
+        self._publish, self.finger, self.facts = publish, finger, facts or GraphFacts()
+        self._state_file = plan_file.with_name("console-state.json")
+        try:
+            state = ConsoleState.model_validate_json(self._state_file.read_bytes())
+        except FileNotFoundError:
+            state = ConsoleState(scene=scenes.first_scene(plan_file))
         self.recording = state.recording
-        self.scenes = SceneController(self._send_scene, files.scenes, state.base, state.sliders)
-        self.finger = finger
-        if state.finger is not None:
-            finger.restore(state.finger)
-        self.eye_view = EyeViewRequester(publish, self.scenes.scene)
-        self.replay = Replay(files.bags)
-        self._publish = publish
+        folder = plan_file.with_name("scenes")
+        self.scenes = SceneController(self._send_scene, folder, state.scene)
+        self.eye_view = EyeViewRequester(publish, state.scene)
         self.stopped: str | None = None
 
     def begin(self) -> None:
@@ -372,7 +302,7 @@ class ConsoleController:
 
         The messages of the previous console process were lost when it exited.
         """
-        self.scenes.publish_current()
+        self._publish(self.scenes.scene)
         if self.recording:
             self._publish(Recording(running=True))
 
@@ -395,7 +325,7 @@ class ConsoleController:
         """Request that the recorder starts or stops a recording, and save this request."""
         self.recording = running
         self._publish(Recording(running=running))
-        self.save_state()
+        self._save_state()
 
     def add_bookmark(self, label: str) -> str:
         """Publish a bookmark, and return its label; replace an empty label by a default label."""
@@ -406,30 +336,8 @@ class ConsoleController:
     def _send_scene(self, scene: Scene) -> None:
         self._publish(scene)
         self.eye_view.on_scene(scene)
-        self.save_state()
+        self._save_state()
 
-    def save_state(self) -> None:
-        """Save the scene, slider positions, recording request and finger position for a restart."""
-        scenes = self.scenes
-        state = ConsoleState(
-            base=scenes.base,
-            sliders=scenes.sliders if scenes.moved else None,
-            recording=self.recording,
-            finger=self.finger.intent if self.finger.commanded else None,
-        )
-        save_state(self._files.state, state)
-
-
-def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Load the saved state of the previous console process.
-
-    warn: function that receives the cause if the saved state is invalid.
-
-    If there is no valid state, the result contains the first scene of the plan.
-    """
-    try:
-        state = load_state(files.state)
-    except scenes.SceneChoiceError as error:
-        warn(str(error))
-        state = None
-    return state or ConsoleState(base=scenes.first_scene(files.plan))
+    def _save_state(self) -> None:
+        state = ConsoleState(scene=self.scenes.scene, recording=self.recording)
+        write_file(self._state_file, state.model_dump_json())

@@ -12,6 +12,7 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
 
 LABEL = "console"
+SPEED_M_PER_S = 0.15
 FRONT_M = 1.5
 """The z coordinate (m, world frame) of the origins of rays from the front."""
 
@@ -83,21 +84,20 @@ class FingerIntent:
 class FingerController:
     """A controller that moves the simulated finger to the requested position at a limited speed.
 
-    commanded: whether a viewer has moved the finger.
     position_m: requested position (x, y) as seen from the front.
 
     Each step is published as a path of one point. Before the first command of a viewer, nothing is
     published, and other programs can control the finger.
     """
 
-    def __init__(self, publish: Callable[[FingerPath], None], *, speed_m_per_s: float) -> None:
-        self._publish, self._speed_m_per_s = publish, speed_m_per_s
+    def __init__(self, publish: Callable[[FingerPath], None]) -> None:
+        self._publish = publish
         self._picker: SurfacePicker | None = None
         self._target: Floats | None = None
         self._arrived = False
         self._last_point = np.array([0.0, 0.0, 0.08])
         self.position_m = (0.0, 0.0)
-        self.commanded = False
+        self._commanded = False
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
@@ -106,11 +106,6 @@ class FingerController:
         picker: object that selects points on the virtual object; None if the shape is unknown.
         """
         self._picker = picker
-        self._update_target()
-
-    def restore(self, intent: FingerIntent) -> None:
-        """Move the finger to the requested position that the previous console process saved."""
-        self.intent, self.commanded = intent, True
         self._update_target()
 
     def touch(self, origin: Floats, direction: Floats) -> None:
@@ -144,7 +139,7 @@ class FingerController:
 
     def _request(self, **changes: object) -> None:
         self.intent = replace(self.intent, **changes)  # type: ignore[arg-type]  # fields of it
-        self.commanded = True
+        self._commanded = True
         self._update_target()
 
     def _update_target(self) -> None:
@@ -152,13 +147,13 @@ class FingerController:
         position = self.intent.position
         if position.is_from_front:
             self.position_m = position.origin_m[:2]
-        if self._picker is not None and self.commanded:
+        if self._picker is not None and self._commanded:
             self._target = target = self.intent.target_m(self._picker)
             if not position.is_from_front:
                 self.position_m = float(target[0]), float(target[1])
 
-    def advance(self, duration_s: float, measured: Floats | None) -> bool:
-        """Publish the next step towards the target, and return whether it was the last step.
+    def advance(self, duration_s: float, measured: Floats | None) -> None:
+        """Publish the next step towards the target.
 
         duration_s: duration of the step.
         measured: measured position (3,) of the finger, m; None if the position is unknown.
@@ -166,8 +161,8 @@ class FingerController:
         if self._target is None or self._picker is None or self._arrived:
             if measured is not None:
                 self._last_point = measured
-            return False
-        max_step_m = self._speed_m_per_s * duration_s
+            return
+        max_step_m = SPEED_M_PER_S * duration_s
         depth_m = 0.0 if self.intent.lifted else self.intent.depth_m
         self._last_point = self._picker.step(
             self._last_point, self._target, depth_m=depth_m, max_step_m=max_step_m
@@ -182,4 +177,3 @@ class FingerController:
                 tremor_m=0.0,
             )
         )
-        return self._arrived

@@ -24,14 +24,14 @@ class GraphFacts:
     recorders: names of the recorder nodes.
     records_on_request: whether a recorder waits for a message on the topic `recording`.
     solvers: names of the nodes that publish the surface mesh of the soft object.
-    consoles: names of the console nodes.
+    simulates_finger: whether the finger is simulated, so that viewers can move it.
     """
 
     others_may_reset: tuple[str, ...] = ()
     recorders: tuple[str, ...] = ()
     records_on_request: bool = False
     solvers: tuple[str, ...] = ()
-    consoles: tuple[str, ...] = ()
+    simulates_finger: bool = False
 
     @classmethod
     def from_plan(cls, plan_file: Path, console: str) -> Self:
@@ -52,7 +52,7 @@ class GraphFacts:
                 for name, node in nodes.items()
                 if any(port["topic"] in skins for port in node["outputs"])
             ),
-            consoles=_with_role(nodes, NodeRole.CONSOLE),
+            simulates_finger=bool(_with_role(nodes, NodeRole.FINGER_SIMULATOR)),
         )
 
 

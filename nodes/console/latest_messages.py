@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.topics import Topic, find_topic
 from flexsheet.messages.wire import WireError, decode
 
 M = TypeVar("M", bound=Message)
-
-
-class MessageSource(Protocol):
-    """The interface of a source of the displayed messages: the running graph or a bag."""
-
-    def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the latest message of a topic with its header, or None before the first message.
-
-        Raises TypeError if the message does not have the type `kind`.
-        """
-        ...
 
 
 class LatestMessages:
@@ -45,6 +34,10 @@ class LatestMessages:
         return unread
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
+        """Return the latest message of a topic with its header, or None before the first message.
+
+        Raises TypeError if the message does not have the type `kind`.
+        """
         frames = self._frames.pop(name, None)
         if frames is not None:
             topic = find_topic(name)
@@ -52,21 +45,12 @@ class LatestMessages:
                 self._opened[name] = decode(frames, topic)
             except WireError as error:
                 self._refused(topic, error)
-        return check_type(self._opened.get(name), kind)
-
-
-def check_type(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
-    """Return a message and its header unchanged, after a check of the message's type.
-
-    Raises TypeError if the message does not have the type `kind`. The entry None is also returned
-    unchanged.
-    """
-    if entry is None:
-        return None
-    message, header = entry
-    if not isinstance(message, kind):
-        raise TypeError(
-            f"expected a message of the type {kind.__name__}, found {type(message).__name__}; "
-            "request the type of the topic"
-        )
-    return message, header
+        if name not in self._opened:
+            return None
+        message, header = self._opened[name]
+        if not isinstance(message, kind):
+            raise TypeError(
+                f"expected a message of the type {kind.__name__}, found {type(message).__name__}; "
+                "request the type of the topic"
+            )
+        return message, header

@@ -16,7 +16,7 @@ from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Bookmark, Display, EStop, FingerPath, Recording, Skin
 from flexsheet.messages.wire import WireError
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.console.controller import ConsoleController, ConsoleFiles
+from flexsheet.nodes.console.controller import ConsoleController
 from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.latest_messages import LatestMessages
@@ -35,35 +35,16 @@ class ConsoleParameters(NodeParameters):
         default=8080, description="TCP port of the page. 0: any free port."
     )
     rate_hz: Positive = Field(default=25.0, description="Update rate of the 3D view, Hz.")
-    tables_hz: Positive = Field(default=2.0, description="Update rate of tables and charts, Hz.")
-    control_finger: bool = Field(
-        default=True, description="Whether viewers can move the simulated finger."
-    )
-    finger_speed_m_per_s: Positive = Field(
-        default=0.15, description="Maximum speed of the simulated finger, m/s."
-    )
-    bags: Path = Field(
-        default=Path("runs"), description="Folder with the bags that viewers can replay."
-    )
     plan: Path = Field(
         default=Path("@run/plan.json"),
-        description="Plan file of the run, which contains the first scene.",
-    )
-    scenes: Path = Field(
-        default=Path("@run/scenes"),
-        description="Folder with the scenes from which viewers can choose.",
-    )
-    state_file: Path = Field(
-        default=Path("@run/console-state.json"),
-        description="File from which a restarted console loads its state.",
+        description="Plan file in the directory of the run, with the first scene and all others.",
     )
 
 
 class Console(Node):
     """A node that serves the console page.
 
-    While the page is open in a browser, the node updates the 3D view, the tables and the charts.
-    The parameters `rate_hz` and `tables_hz` set the update rates.
+    While the page is open in a browser, the node updates the 3D view and the texts.
     """
 
     takes_frames: ClassVar[bool] = True
@@ -97,17 +78,15 @@ class Console(Node):
         self._latest = LatestMessages(self._refused)
         self._server = start_server(settings.page_port, "flexsheet")
         self.url = f"http://{ADDRESS}:{self._server.get_port()}/"
-        finger = FingerController(self._publish, speed_m_per_s=settings.finger_speed_m_per_s)
-        files = ConsoleFiles(settings.plan, settings.scenes, settings.bags, settings.state_file)
+        finger = FingerController(self._publish)
         facts = GraphFacts.from_plan(settings.plan, self.name)
-        controller = ConsoleController(self._publish, files, finger, self.log.warning, facts)
+        controller = ConsoleController(self._publish, settings.plan, finger, facts)
         self.operator = Operator(
             self._server,
             self._latest,
             controller,
             self._request,
             name=self.name,
-            with_finger=settings.control_finger,
             with_eye=further_port("twin/eye") in self.inputs,
         )
         controller.begin()
@@ -134,17 +113,11 @@ class Console(Node):
 
     @periodic("rate_hz")
     def draw(self) -> None:
-        """Update the 3D view and all moving elements of the page."""
+        """Move the finger, and update the page."""
         now_s = self.clock.now_ns() * 1e-9
         viewers = len(self._server.get_clients())
         self.set_note(NoteCode.INFO, f"{self.url}, viewers: {viewers}")
         self._call(self.operator.advance, now_s, viewers > 0)
-
-    @periodic("tables_hz")
-    def refresh_tables(self) -> None:
-        """Update the tables and charts of the page."""
-        if self._server.get_clients():
-            self._call(self.operator.refresh_tables, self.clock.now_ns() * 1e-9)
 
     def _publish(self, message: Message) -> None:
         kind = type(message)

@@ -1,7 +1,9 @@
-// Add to viser's page: names of its controls, titles of buttons, missing keys, the browser's dark mode,
-// and a message when the connection is lost.  It runs before viser's own script.
+// Add to viser's page: names of its controls, titles of buttons, missing keys, and a message
+// when the connection is lost.  It runs before viser's own script.
 (() => {
   "use strict";
+
+  document.title = "flexsheet console";
 
   const STOP = "E-STOP";
   const LOST =
@@ -11,14 +13,6 @@
   const VIEW =
     "3D view of arms, sheet, object and finger. The arrow keys rotate the view. The keys W, A, S, D, " +
     "Q and E move the view. The sliders in the tab Touch move the finger.";
-
-  // viser reads the dark mode from the address only.
-  const asked = new URLSearchParams(location.search);
-  const wantsDark = matchMedia("(prefers-color-scheme: dark)").matches;
-  if (wantsDark && !asked.has("darkMode") && !asked.has("token")) {
-    asked.set("darkMode", "");
-    history.replaceState(null, "", `?${asked}`);
-  }
 
   const stopButton = () =>
     [...document.querySelectorAll("#root button")].find((one) => one.textContent.startsWith(STOP));

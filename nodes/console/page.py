@@ -6,12 +6,12 @@ from typing import Any
 
 import viser
 
-from flexsheet.messages.scene import Scene
 from flexsheet.nodes.console import banner, panels
 from flexsheet.nodes.console.banner import GraphState
-from flexsheet.nodes.console.controller import ConsoleController
+from flexsheet.nodes.console.controller import SceneController
+from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.scene_view import SceneView
-from flexsheet.nodes.console.tabs import EyeTab, GraphTab, RecordTab, Request, TouchTab
+from flexsheet.nodes.console.tabs import EyeTab, RecordTab, Request, TouchTab
 
 BRAND = (14, 92, 132)
 STOP_COLOR = (185, 28, 28)
@@ -22,23 +22,14 @@ MAIN_WIDTH, STOP_WIDTH = 380, 320
 class Page:
     """The panels of the page next to the 3D view."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        request: Request,
-        *,
-        with_finger: bool,
-        others_may: tuple[str, ...],
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, request: Request, facts: GraphFacts) -> None:
         """Build the panels.
 
         request: function that passes a viewer's request to the node.
-        with_finger: whether the page has controls for the finger.
-        others_may: hosts that may reset an e-stop if the console's own host may not; otherwise
-            empty.
+        facts: properties of the graph, which determine the available controls.
         """
         self._gui: Any = server.gui
-        self._request, self._others_may = request, others_may
+        self._request, self._others_may = request, facts.others_may_reset
         self.view = SceneView(server, lambda *ray: request("touch", *ray))
         self._gui.configure_theme(
             dark_mode=False, show_logo=False, show_share_button=False, brand_color=BRAND
@@ -49,9 +40,9 @@ class Page:
         self._problem = self._gui.add_html("")
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Touch", viser.Icon.HAND_FINGER):
-            self.touch = TouchTab(self._gui, request, self.view, with_finger=with_finger)
+            self.touch = TouchTab(self._gui, request, with_finger=facts.simulates_finger)
         with tabs.add_tab("Graph", viser.Icon.TOPOLOGY_STAR):
-            self.graph = GraphTab(self._gui)
+            self.nodes = self._gui.add_html("")
         with tabs.add_tab("Eye", viser.Icon.EYE):
             self.eye = EyeTab(self._gui, request)
         with tabs.add_tab("Record", viser.Icon.PLAYER_RECORD):
@@ -72,13 +63,10 @@ class Page:
         command = self._gui.add_command("E-stop: stop both arms", hotkey="escape")
         command.on_trigger(lambda _: self._request("stop", "Escape at the console"))
 
-    def show_scene(self, scene: Scene, controller: ConsoleController) -> None:
-        """Show the values of a scene from the graph or from a bag."""
-        self.view.set_scene(scene)
-        self.touch.show_scene(
-            scene, controller.scenes.base, controller.scenes.names, controller.scenes.sliders
-        )
-        self.eye.show_correction(controller.eye_view.correction)
+    def show_scene(self, scenes: SceneController) -> None:
+        """Show the present scene and its values."""
+        self.view.set_scene(scenes.scene)
+        self.touch.show_scene(scenes.scene.name, scenes.base, scenes.names, scenes.sliders)
 
     def show_problem(self, text: str) -> None:
         """Show an error, or remove the shown error if the text is empty."""
