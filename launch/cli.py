@@ -44,10 +44,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "calibrate": (
         "calibrate",
         "calibrate_arms",
-        "calibrate_edges",
-        "calibrate_marker",
         "calibrate_projector",
-        "calibrate_sheet",
+        "calibrate_rows",
     ),
     "commission": ("commission",),
     "precompute": ("precompute",),

@@ -29,8 +29,8 @@ from flexsheet.launch.calibration.prediction import Knowledge, PredictedError, d
 from flexsheet.launch.calibration.sheet_rows import simulate_rows
 from flexsheet.launch.calibration.touches import simulate_touches
 from flexsheet.launch.commands import capture
-from flexsheet.launch.commands.calibrate_marker import make_calibration as fit_marker
-from flexsheet.launch.commands.calibrate_sheet import make_calibration as fit_sheet
+from flexsheet.launch.commands.calibrate_rows import make_marker_calibration as fit_marker
+from flexsheet.launch.commands.calibrate_rows import make_sheet_calibration as fit_sheet
 from flexsheet.launch.commands.commission_steps import (
     BOARD,
     INSTRUCTIONS,

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import typer
 from ruamel.yaml import YAML
 
 from flexsheet.launch.commands import experiment
-from flexsheet.launch.commands.options import split_names
 from flexsheet.launch.experiments import finger_paths, select_names
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.messages.scene import Scene
@@ -31,10 +29,6 @@ def test_names_are_chosen_once_each_and_checked() -> None:
     assert select_names(["tap", "stop", "tap"], finger_paths.GESTURES, "gesture") == ["tap", "stop"]
     with pytest.raises(BadInputError, match=r'tapp: unknown gesture; did you mean "tap"\?'):
         select_names(["hold", "tapp"], finger_paths.GESTURES, "gesture")
-    # One value with commas is the former form of a repeated option.
-    assert split_names(["tap, stop", "hold"]) == ["tap", "stop", "hold"]
-    with pytest.raises(typer.BadParameter, match="omit the option to select all"):
-        split_names([" ,"])
 
 
 def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:

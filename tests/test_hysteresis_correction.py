@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.sheet_fit import MeasuredPush, SheetModelFitError
 from flexsheet.launch.calibration.sheet_rows import read_rows
-from flexsheet.launch.commands.calibrate_sheet import make_calibration
+from flexsheet.launch.commands.calibrate_rows import make_sheet_calibration
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.nodes.models.sheet.force_models import SheetPush
@@ -90,7 +90,7 @@ def pushes(ratio: float, noise: float = 0.002) -> list[MeasuredPush]:
 
 def calibrate(rows: list[MeasuredPush]) -> SheetCalibration:
     lines = list(range(len(rows)))
-    return make_calibration(SCENE, rows, lines, source="test")
+    return make_sheet_calibration(SCENE, rows, lines, source="test")
 
 
 def test_the_calibration_estimates_the_hysteresis() -> None:

@@ -23,7 +23,7 @@ from flexsheet.launch.calibration.sheet_fit import (
 from flexsheet.launch.calibration.sheet_rows import read_rows, simulate_rows
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
 from flexsheet.launch.cli import app
-from flexsheet.launch.commands.calibrate_sheet import make_calibration
+from flexsheet.launch.commands.calibrate_rows import make_sheet_calibration
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
@@ -261,7 +261,7 @@ def twin_calibration() -> SheetCalibration:
         update={"working_range": SCENE.working_range.model_copy(update={"push_depth_m": 0.02})}
     )
     rows = simulate_rows(small, noise_n=0.003, seed=2)
-    return make_calibration(small, rows, list(range(len(rows))), source="twin")
+    return make_sheet_calibration(small, rows, list(range(len(rows))), source="twin")
 
 
 def test_twin_sheet_is_identified_from_its_pushes(twin_calibration: SheetCalibration) -> None:

@@ -265,9 +265,9 @@ def export(
     *,
     bag: options.BagArgument,
     output: Annotated[
-        Path | None,
+        Path,
         options.output_file("MCAP file, or folder of a ROS 2 bag (--format ros2), to write."),
-    ] = None,
+    ],
     form: Annotated[
         Literal["foxglove", "ros2", "bag"],
         typer.Option(
@@ -280,8 +280,6 @@ def export(
     as_json: options.JsonOption = False,
 ) -> None:
     """Convert a bag for the viewers Foxglove and Rerun or for ROS 2, or repair a damaged bag."""
-    if output is None:
-        raise CommandError("the output file is missing; add --output FILE")
     if form == "bag":
         from flexsheet.messages.bag import recover
 

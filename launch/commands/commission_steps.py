@@ -33,10 +33,8 @@ from flexsheet.launch.calibration.commission import (
 from flexsheet.launch.commands import (
     calibrate,
     calibrate_arms,
-    calibrate_edges,
-    calibrate_marker,
     calibrate_projector,
-    calibrate_sheet,
+    calibrate_rows,
     capture,
 )
 from flexsheet.launch.plans.apparatus import format_apparatus
@@ -275,13 +273,13 @@ class Laboratory:
             pushes, lines = read_rows(file, scene.sheet, scene.finger.radius_m)
             source, mass_kg_per_m2 = str(file), self.sheet_kg_per_m2
         else:
-            pushes = calibrate_sheet.simulate_pushes(scene, self.apparatus, seed=self.seed)
+            pushes = calibrate_rows.simulate_pushes(scene, self.apparatus, seed=self.seed)
             lines, source = list(range(1, len(pushes) + 1)), f"twin of {scene.name}"
             true = apply_apparatus(scene, self.apparatus).sheet
             weighing = np.random.default_rng([self.seed, 3]).normal(1.0, WEIGHING_RATIO)
             mass_kg_per_m2 = float(true.density_kg_per_m3 * true.thickness_m * weighing)
         try:
-            found = calibrate_sheet.make_calibration(scene, pushes, lines, source=source)
+            found = calibrate_rows.make_sheet_calibration(scene, pushes, lines, source=source)
         except SheetModelFitError as error:
             raise CommissionError(
                 f"the sheet cannot be calibrated with the data of {source}: {error}"
@@ -381,7 +379,7 @@ class Laboratory:
             limit=0.4,
             advice="Check the marks and their fixing; repeat the step arms.",
             uncertainty=uncertainty,
-            scene_values=calibrate_edges.list_scene_values(fits),
+            scene_values=calibrate_rows.list_arm_values(fits),
         )
 
     def calibrate_marker(self, lab: Commissioning) -> StepResult:
@@ -397,7 +395,7 @@ class Laboratory:
             source = f"twin of {scene.name}"
             true_m = apply_apparatus(scene, self.apparatus).finger.radius_m
             radius_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
-        found = calibrate_marker.make_calibration(touches, scene, source)
+        found = calibrate_rows.make_marker_calibration(touches, scene, source)
         found.save(lab.folder / MARKER)
         uncertainty = {
             f"{axis}_mm": 1e3 * deviation_m

@@ -511,7 +511,7 @@ def sensitivity(
     from flexsheet.launch.experiments import sensitivity as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile, load_tolerances
 
-    selected = select_names(options.split_names(parameters), load_tolerances(), "parameter")
+    selected = select_names(parameters or [], load_tolerances(), "parameter")
     folder = make_result_folder(output, "sensitivity")
     with progress_words() as progress:
         result = experiment.run_sensitivity(

@@ -226,17 +226,6 @@ def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
     return [*([] if scene is None else [f"scene={scene}"]), *(settings or ())]
 
 
-def split_names(given: list[str] | None) -> list[str]:
-    """Return the values of a repeated option, and split values in the former format "A,B".
-
-    Raises BadParameter if the option is given but contains no name.
-    """
-    names = [name.strip() for one in given or () for name in one.split(",") if name.strip()]
-    if given and not names:
-        raise typer.BadParameter("the value is empty; omit the option to select all")
-    return names
-
-
 _VALUE_NAMES = {"str": "TEXT", "int": "N", "float": "NUMBER", "Path": "FILE", "list[str]": "TEXT"}
 
 
