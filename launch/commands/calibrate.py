@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from flexsheet.messages.calibration import Board, StereoCalibration
     from flexsheet.messages.scene import Pose, Scene
 
-app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="Calibrate cameras, arms, projector and sheet."
-)
+app = options.make_app("Calibrate cameras, arms, projector and sheet.")
 
 LeftOption = Annotated[
     str,
@@ -168,11 +166,8 @@ def stereo(
             working_distance_m=None if scene is None else measure_distance_m(scene),
             progress=progress,
         )
-    calibrated.calibration.save(output, comment=command_line())
-    _print_result(calibrated.calibration, output, as_json)
-
-
-def _print_result(calibration: StereoCalibration, output: Path, as_json: bool) -> None:
+    calibration = calibrated.calibration
+    calibration.save(output, comment=command_line())
     uncertainty = calibration.uncertainty
     assert uncertainty is not None
     result = {

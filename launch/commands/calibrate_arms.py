@@ -108,8 +108,8 @@ def arms(
     if twin == (left_arm is not None or right_arm is not None):
         raise CommandError("give either --twin, or --left-arm, --right-arm or both")
     require_twin(apparatus, simulated=twin)
-    if copy is not None:
-        _check_new_file(copy, "--write-scene")
+    if copy is not None and copy.exists():
+        raise CommandError(f"--write-scene {copy}: the file exists; name a new file")
     scene = load_scene(scene_file)
     true = load_true_devices(apparatus, scene)
     described = parse_board(board, square_mm, marker_mm, dictionary)
@@ -130,12 +130,25 @@ def arms(
     measured.save(output, comment=command_line())
     if copy is not None:
         write_scene_values(scene_file, list_scene_values(measured), copy)
-    truth = (
-        {side: _true_errors(scene, side, fits[side], true, seed) for side in fits} if twin else {}
-    )
-    _print_result(
-        measured, scene, blind=blind, truth=truth, output=output, copy=copy, as_json=as_json
-    )
+    result: dict[str, Any] = {
+        "calibration": str(output),
+        "scene": None if copy is None else str(copy),
+        "arms": {},
+    }
+    for side, without_board in blind.items():
+        base: ArmBase = getattr(measured, side)
+        outliers = [(one.name, one.reason) for one in base.poses if not one.used]
+        moved_m, turned_rad = _compute_shift(base, scene, side)
+        result["arms"][side] = {
+            **base.model_dump(mode="json", exclude={"flange_from_board", "covariance", "poses"}),
+            "moved_from_scene_m": moved_m,
+            "rotation_from_scene_rad": turned_rad,
+            "poses_used": sum(one.used for one in base.poses),
+            "poses": len(base.poses) + len(without_board),
+            "left_out": dict([*without_board, *outliers]),
+            **(_true_errors(scene, side, fits[side], true, seed) if twin else {}),
+        }
+    print_result(result, as_json=as_json)
 
 
 @app.command(
@@ -275,11 +288,6 @@ async def record_poses(
     return 0
 
 
-def _check_new_file(path: Path, option: str) -> None:
-    if path.exists():
-        raise CommandError(f"{option} {path}: the file exists; name a new file")
-
-
 def simulate_folder(
     scene: Scene,
     board: Board,
@@ -398,37 +406,6 @@ def _true_errors(
         "true_error_m": float(np.linalg.norm(error[:3, 3])),
         "true_error_rad": float(np.linalg.norm(vector_from_rotation(error[:3, :3]))),
     }
-
-
-def _print_result(
-    measured: ArmsCalibration,
-    scene: Scene,
-    *,
-    blind: dict[Side, list[tuple[str, str]]],
-    truth: dict[Side, dict[str, float]],
-    output: Path,
-    copy: Path | None,
-    as_json: bool,
-) -> None:
-    result: dict[str, Any] = {
-        "calibration": str(output),
-        "scene": None if copy is None else str(copy),
-        "arms": {},
-    }
-    for side, without_board in blind.items():
-        base: ArmBase = getattr(measured, side)
-        outliers = [(one.name, one.reason) for one in base.poses if not one.used]
-        moved_m, turned_rad = _compute_shift(base, scene, side)
-        result["arms"][side] = {
-            **base.model_dump(mode="json", exclude={"flange_from_board", "covariance", "poses"}),
-            "moved_from_scene_m": moved_m,
-            "rotation_from_scene_rad": turned_rad,
-            "poses_used": sum(one.used for one in base.poses),
-            "poses": len(base.poses) + len(without_board),
-            "left_out": dict([*without_board, *outliers]),
-            **truth.get(side, {}),
-        }
-    print_result(result, as_json=as_json)
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:

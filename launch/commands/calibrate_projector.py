@@ -30,7 +30,6 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import require_projector
 
 if TYPE_CHECKING:
-    from flexsheet.launch.calibration.projector import ProjectorFit
     from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.scene import Projector, Scene, StereoCamera
     from flexsheet.nodes.arrays import Image
@@ -124,7 +123,26 @@ def projector(
     )
     if output is not None:
         write_scene_values(scene_file, list_scene_values(fit.projector), output)
-    _print_result(scene, fit, true, output, as_json=as_json)
+    lens, pose = fit.projector.lens, fit.projector.world_from_projector
+    result: dict[str, Any] = {
+        "scene": None if output is None else str(output),
+        "poses": fit.poses,
+        "points": fit.points,
+        "outliers": fit.outliers,
+        "rms_px": fit.rms_px,
+        "rms_mm": 1e3 * fit.rms_m,
+        "held_out_rms_px": fit.held_out_rms_px,
+        "before_rms_px": fit.before_rms_px,
+        "coverage_ratio": fit.coverage_ratio,
+        "depth_range_mm": 1e3 * fit.depth_range_m,
+        "lens": lens.model_dump(),
+        **pose.model_dump(mode="json"),
+    }
+    if true is not None:
+        result["eye_error_mm"] = _eye_errors_mm(scene, fit.projector, true)
+        named = {"width_px", "height_px", "lens", "world_from_projector"}
+        result["true_projector"] = true.model_dump(mode="json", include=named)
+    print_result(result, as_json=as_json)
 
 
 def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
@@ -219,31 +237,6 @@ def list_scene_values(projector: Projector) -> dict[str, Any]:
         values[f"projector.lens.{key}"] = round_digits(getattr(projector.lens, key))
     values["projector.lens.distortion"] = [round_digits(k) for k in projector.lens.distortion]
     return values
-
-
-def _print_result(
-    scene: Scene, fit: ProjectorFit, true: Projector | None, output: Path | None, *, as_json: bool
-) -> None:
-    lens, pose = fit.projector.lens, fit.projector.world_from_projector
-    result: dict[str, Any] = {
-        "scene": None if output is None else str(output),
-        "poses": fit.poses,
-        "points": fit.points,
-        "outliers": fit.outliers,
-        "rms_px": fit.rms_px,
-        "rms_mm": 1e3 * fit.rms_m,
-        "held_out_rms_px": fit.held_out_rms_px,
-        "before_rms_px": fit.before_rms_px,
-        "coverage_ratio": fit.coverage_ratio,
-        "depth_range_mm": 1e3 * fit.depth_range_m,
-        "lens": lens.model_dump(),
-        **pose.model_dump(mode="json"),
-    }
-    if true is not None:
-        result["eye_error_mm"] = _eye_errors_mm(scene, fit.projector, true)
-        shown = {"width_px", "height_px", "lens", "world_from_projector"}
-        result["true_projector"] = true.model_dump(mode="json", include=shown)
-    print_result(result, as_json=as_json)
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:

@@ -53,16 +53,10 @@ def view(
     computer. To use a viewer on another computer, first run this command there:
     ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER
     """
-    try:
-        import foxglove  # noqa: F401
-    except ImportError as error:
-        raise CommandError(
-            "view needs the package foxglove-sdk; run: pip install 'flexsheet[view]'"
-        ) from error
-    plan, found = running_graph(run)
-    os.nice(NICENESS)
     from flexsheet.launch.viewing.live_server import LiveServer
 
+    plan, found = running_graph(run)
+    os.nice(NICENESS)
     make_server = partial(
         LiveServer,
         plan,
