@@ -312,9 +312,7 @@ def verify(
     bag: options.BagArgument,
     node: Annotated[
         str,
-        typer.Argument(
-            help="Name of a node of the graph that was recorded.",
-        ),
+        typer.Argument(help="Name of a node of the graph that was recorded."),
     ],
     tolerance: Annotated[
         float,

@@ -69,7 +69,6 @@ CalibrationOption = Annotated[
     Path | None,
     typer.Option(
         "--calibration",
-        metavar="FILE",
         help="Stereo calibration file; default: the camera parameters of the scene are used.",
     ),
 ]

@@ -23,9 +23,7 @@ app = make_app()
 )
 def keys(
     *,
-    host: Annotated[
-        str, typer.Argument(metavar="HOST", help="Name of the host in the launch file.")
-    ],
+    host: Annotated[str, typer.Argument(help="Name of the host in the launch file.")],
     replace: Annotated[
         bool,
         typer.Option(

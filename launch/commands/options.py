@@ -128,10 +128,7 @@ DurationOption = Annotated[
 ]
 TopicArgument = Annotated[
     str,
-    typer.Argument(
-        metavar="TOPIC",
-        help="Name of the topic, such as twin/finger.",
-    ),
+    typer.Argument(help="Name of the topic, such as twin/finger."),
 ]
 TopicsOption = Annotated[
     list[str] | None,
@@ -141,7 +138,7 @@ TopicsOption = Annotated[
         help="Topic to include; repeat the option for several topics; default: all topics.",
     ),
 ]
-BagArgument = Annotated[Path, typer.Argument(metavar="BAG", help="Bag file.")]
+BagArgument = Annotated[Path, typer.Argument(help="Bag file.")]
 ResultFolderOption = Annotated[
     Path | None,
     typer.Option(
@@ -155,7 +152,6 @@ WorkersOption = Annotated[
     int,
     typer.Option(
         "--workers",
-        metavar="N",
         min=1,
         max=64,
         help="Number of trials that run at the same time on this computer.",
@@ -187,7 +183,6 @@ SeedOption = Annotated[
     int,
     typer.Option(
         "--seed",
-        metavar="N",
         help="Random seed of the simulated measurements, such as poses and noise. The errors of "
         "the simulated hardware have another seed, which --apparatus seed:N sets.",
     ),

@@ -255,10 +255,7 @@ def _list_suspicions(statuses: dict[str, Status]) -> list[dict[str, Any]]:
 def logs(
     node: Annotated[
         str | None,
-        typer.Argument(
-            metavar="NODE",
-            help="Name of a node of the graph; without it, the nodes are listed.",
-        ),
+        typer.Argument(help="Name of a node of the graph; without it, the nodes are listed."),
     ] = None,
     lines: Annotated[
         int | None, typer.Option("-n", "--lines", min=0, help="Print the last N lines only.")
