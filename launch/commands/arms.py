@@ -147,7 +147,31 @@ async def _confirm_stops(
             for directory in chosen
         )
     )
-    _show_stop(results, as_json)
+
+    def name_run(result: _StopResult) -> dict[str, Any]:
+        return {} if len(results) == 1 else {"run": str(result.run)}
+
+    paths = [
+        {
+            **name_run(result),
+            "path": one.path.value,
+            "receiver": one.receiver,
+            "outcome": one.outcome.value,
+            "after_ms": round(one.after_ms, 1),
+        }
+        for result in results
+        for one in result.attempts
+    ]
+    arms = [
+        {**name_run(result), **row} for result in results for row in describe_arms(result.arms, {})
+    ]
+    if as_json:
+        stopped = all(result.confirmed for result in results)
+        print_json({"stopped": stopped, "paths": paths, "arms": arms})
+    else:
+        print_rows(paths, as_json=False)
+        print()
+        print_rows(arms, as_json=False)
     for result in results:
         where = "" if len(results) == 1 else f" of {result.run}"
         if not result.shown:
@@ -344,35 +368,3 @@ def describe_arms(arms: dict[str, ArmState], notes: dict[str, str]) -> list[dict
         }
         for side in SIDES
     ]
-
-
-def _show_stop(results: list[_StopResult], as_json: bool) -> None:
-    """Print the stop attempts and the states of the arms.
-
-    If there are several runs, each row names its run.
-    """
-
-    def name_run(result: _StopResult) -> dict[str, Any]:
-        return {} if len(results) == 1 else {"run": str(result.run)}
-
-    paths = [
-        {
-            **name_run(result),
-            "path": one.path.value,
-            "receiver": one.receiver,
-            "outcome": one.outcome.value,
-            "after_ms": round(one.after_ms, 1),
-        }
-        for result in results
-        for one in result.attempts
-    ]
-    arms = [
-        {**name_run(result), **row} for result in results for row in describe_arms(result.arms, {})
-    ]
-    if as_json:
-        stopped = all(result.confirmed for result in results)
-        print_json({"stopped": stopped, "paths": paths, "arms": arms})
-        return
-    print_rows(paths, as_json=False)
-    print()
-    print_rows(arms, as_json=False)

@@ -10,7 +10,7 @@ import webbrowser
 from collections.abc import Callable, Collection
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -119,7 +119,11 @@ def launch(
 
     def ready(run: Run) -> None:
         if as_json:
-            print_json_line(describe_run(plan, run, host))
+            nodes = [node.name for node in plan.nodes_on(host)]
+            omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
+            print_json_line(
+                {"run": str(run.directory), "plan": plan.hash, "nodes": nodes, "omitted": omitted}
+            )
         for node in plan.nodes_on(host):
             # The launcher does not know a free port that the console chooses (0).
             if (
@@ -147,16 +151,6 @@ def precompute_tables(plan: ResolvedGraph, host: str | None) -> None:
 def page_url(console: ResolvedNode) -> str:
     """Return the URL of a console's page. The console node must have a fixed port."""
     return f"http://127.0.0.1:{console.parameters['page_port']}/"
-
-
-def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
-    """Return the run directory, plan hash and node names of a graph, for JSON output.
-
-    host: host whose nodes are listed. If it is None, the nodes of all hosts are listed.
-    """
-    nodes = [node.name for node in plan.nodes_on(host)]
-    omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
-    return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes, "omitted": omitted}
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:

@@ -275,22 +275,9 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
 
         yield print_line
         return
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import Progress
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
-    with Progress(*columns, console=words.console, transient=True) as bar:
+    with Progress(console=words.console, transient=True) as bar:
         task = bar.add_task(label, total=None)
         yield lambda done, total, text=label: bar.update(
             task, completed=done, total=total, description=text

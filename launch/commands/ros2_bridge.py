@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections import Counter
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
-from flexsheet.launch.commands.output import CommandError, examples, print_json, words
-
-if TYPE_CHECKING:
-    from flexsheet.launch.plans.plan_model import ResolvedGraph
-    from flexsheet.launch.ros2.dds import RosParticipant
-    from flexsheet.launch.running.runs import Run
+from flexsheet.launch.commands.output import CommandError, examples, print_outcome, words
 
 app = options.make_app()
 
@@ -48,7 +42,7 @@ def ros2_bridge(
     ROS nodes cannot publish in the graph. By default the bridge uses the loopback interface. The
     environment variable ROS_DOMAIN_ID sets the DDS domain.
     """
-    from flexsheet.launch.ros2.bridge import list_default_topics
+    from flexsheet.launch.ros2.bridge import Ros2Bridge, list_default_topics
     from flexsheet.launch.ros2.dds import MAX_DOMAIN, RosParticipant
     from flexsheet.messages.topics import find_topic
 
@@ -68,40 +62,21 @@ def ros2_bridge(
         )
     participant = RosParticipant(int(domain), interface)
     words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop")
-    published: Counter[str] = Counter()
-    run_interruptible(
-        _run(plan, found, participant, names, duration_s=duration, published=published)
-    )
-    if as_json:
-        print_json({"published": published})
-        return
+    published: dict[str, int] = {}
+
+    async def bridge_topics() -> int:
+        bridge = Ros2Bridge(plan, found, participant, topics=names, on_problem=words.print)
+        try:
+            bridge.start()
+            async with asyncio.timeout(duration):
+                await asyncio.Event().wait()
+        except TimeoutError:
+            pass
+        finally:
+            bridge.close()
+            published.update(bridge.published)
+        return 0
+
+    run_interruptible(bridge_topics())
     listed = ", ".join(f"{number} {name}" for name, number in sorted(published.items()))
-    words.print(f"published: {listed or 'none'}")
-
-
-async def _run(
-    plan: ResolvedGraph,
-    run: Run,
-    participant: RosParticipant,
-    topics: list[str],
-    *,
-    duration_s: float | None,
-    published: Counter[str],
-) -> int:
-    """Bridge a graph for a duration (None: until Ctrl-C); always return 0, the exit code.
-
-    published: counter to which the numbers of messages by ROS topic are added.
-    """
-    from flexsheet.launch.ros2.bridge import Ros2Bridge
-
-    bridge = Ros2Bridge(plan, run, participant, topics=topics, on_problem=words.print)
-    try:
-        bridge.start()
-        async with asyncio.timeout(duration_s):
-            await asyncio.Event().wait()
-    except TimeoutError:
-        pass
-    finally:
-        bridge.close()
-        published.update(bridge.published)
-    return 0
+    print_outcome({"published": published}, f"published: {listed or 'none'}", as_json=as_json)

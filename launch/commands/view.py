@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,9 +12,6 @@ from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.options import DurationOption, JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import CommandError, examples, print_json_line, words
 from flexsheet.launch.plans.shipped import LAUNCH_FILES
-
-if TYPE_CHECKING:
-    from flexsheet.launch.viewing.live_server import LiveServer
 
 app = make_app()
 
@@ -53,45 +48,38 @@ def view(
     computer. To use a viewer on another computer, first run this command there:
     ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER
     """
-    from flexsheet.launch.viewing.live_server import LiveServer
+    from flexsheet.launch.viewing.live_server import ADDRESS, LiveServer
 
     plan, found = running_graph(run)
     os.nice(NICENESS)
-    make_server = partial(
-        LiveServer,
-        plan,
-        found,
-        port=port,
-        rate_hz=rate,
-        image_rate_hz=image_rate,
-        on_problem=words.print,
-    )
-    raise typer.Exit(run_interruptible(_serve(make_server, port, duration, as_json)))
 
-
-async def _serve(
-    make_server: Callable[[], LiveServer], port: int, duration_s: float | None, as_json: bool
-) -> int:
-    """Serve viewers for a duration (None: until Ctrl-C); always return 0, the exit code."""
-    from flexsheet.launch.viewing.live_server import ADDRESS
-
-    try:
-        server = make_server()
-    except (OSError, RuntimeError) as error:
-        raise CommandError(
-            f"--port {port}: the server cannot listen there: {error}; choose another port"
-        ) from error
-    try:
-        address = f"ws://{ADDRESS}:{server.port}"
-        if as_json:
-            names = [channel.name for channel in server.channels]
-            print_json_line({"address": address, "layout": str(LAYOUT), "channels": names})
-        words.print(f"connect Foxglove or Lichtblick to {address}")
-        words.print(f"layout: {LAYOUT}")
-        async with asyncio.timeout(duration_s):
-            await server.serve()
-    except TimeoutError:
+    async def serve() -> int:
+        try:
+            server = LiveServer(
+                plan,
+                found,
+                port=port,
+                rate_hz=rate,
+                image_rate_hz=image_rate,
+                on_problem=words.print,
+            )
+        except (OSError, RuntimeError) as error:
+            raise CommandError(
+                f"--port {port}: the server cannot listen there: {error}; choose another port"
+            ) from error
+        try:
+            address = f"ws://{ADDRESS}:{server.port}"
+            if as_json:
+                names = [channel.name for channel in server.channels]
+                print_json_line({"address": address, "layout": str(LAYOUT), "channels": names})
+            words.print(f"connect Foxglove or Lichtblick to {address}")
+            words.print(f"layout: {LAYOUT}")
+            async with asyncio.timeout(duration):
+                await server.serve()
+        except TimeoutError:
+            return 0
+        finally:
+            server.close()
         return 0
-    finally:
-        server.close()
-    return 0
+
+    raise typer.Exit(run_interruptible(serve()))
