@@ -151,11 +151,10 @@ class Live(BaseModel):
 
 
 class Values(BaseModel):
-    """A model with one value for each type of pydantic error that has its own remedy."""
+    """A model with a value for each type of pydantic error."""
 
     above_pa: float = Field(1.0, gt=0.0)
     least_m: float = Field(1.0, ge=0.5)
-    below_s: float = Field(1.0, lt=2.0)
     most: int = Field(1, le=3)
     finite_rad: Annotated[float, Field(allow_inf_nan=False)] = 0.0
     whole: int = 0
@@ -163,51 +162,53 @@ class Values(BaseModel):
     side: Side = Side.LEFT
     name: str = ""
     on: bool = False
-    several: list[int] = []
     pair: tuple[int, int] = (0, 0)
-    file: Path = Path()
     source: Annotated[Twin | Live, Field(discriminator="kind")] = Twin(kind="twin")
-    some: Annotated[list[int], Field(min_length=2, max_length=3)] = [0, 0]
+    some: Annotated[list[int], Field(min_length=2)] = [0, 0]
 
 
 INVALID = {
-    "greater_than": ("above_pa: -1", "give a value greater than 0 Pa"),
-    "greater_than_equal": ("least_m: 0.1", "give a value of at least 0.5 m"),
-    "less_than": ("below_s: 2", "give a value less than 2 s"),
-    "less_than_equal": ("most: 4", "give a value of at most 3"),
-    "finite_number": ("finite_rad: .inf", "write a finite number"),
-    "int_from_float": ("whole: 1.5", "write an integer"),
-    "literal_error": ("choice: c", "write 'a' or 'b'"),
-    "enum": ("side: c", "write 'left' or 'right'"),
-    "union_tag_invalid": ("source: {kind: twn}", "write 'twin', 'live'"),
-    "union_tag_not_found": ("source: {}", "add the key 'kind'"),
-    "string_type": ("name: 3", "write a text"),
-    "bool_type": ("on: []", "write true or false"),
-    "bool_parsing": ("on: maybe", "write true or false"),
-    "list_type": ("several: 3", "write a list"),
-    "tuple_type": ("pair: 3", "write a list"),
-    "path_type": ("file: 3", "write the path of a file"),
-    "too_short": ("some: [1]", "give 2 or more values"),
-    "too_long": ("some: [1, 2, 3, 4]", "give 3 or fewer values"),
+    "greater_than": ("above_pa", "-1"),
+    "less_than_equal": ("most", "4"),
+    "finite_number": ("finite_rad", ".inf"),
+    "int_from_float": ("whole", "1.5"),
+    "literal_error": ("choice", "c"),
+    "enum": ("side", "c"),
+    "union_tag_invalid": ("source", "{kind: twn}"),
+    "union_tag_not_found": ("source", "{}"),
+    "string_type": ("name", "3"),
+    "bool_parsing": ("on", "maybe"),
+    "tuple_type": ("pair", "3"),
+    "too_short": ("some", "[1]"),
 }
-"""An invalid value for each type of pydantic error, and the remedy."""
-
-
-def test_each_remedy_of_a_value_is_tested() -> None:
-    assert INVALID.keys() == documents.LIMIT_REMEDIES.keys() | documents.REMEDIES.keys()
+"""The key and an invalid value for types of pydantic errors."""
 
 
 @pytest.mark.parametrize("type_", list(INVALID))
-def test_an_invalid_value_has_its_own_remedy(tmp_path: Path, type_: str) -> None:
-    text, remedy = INVALID[type_]
+def test_an_invalid_value_is_reported_with_the_text_of_pydantic(tmp_path: Path, type_: str) -> None:
+    key, value = INVALID[type_]
     file = tmp_path / "values.yaml"
-    file.write_text(text)
+    file.write_text(f"{key}: {value}")
+    document = read_document(file)
     with pytest.raises(ValidationError) as library:
-        Values.model_validate(read_document(file).values)
-    assert [one["type"] for one in library.value.errors()] == [type_]
+        Values.model_validate(document.values)
+    (error,) = library.value.errors()
+    assert error["type"] == type_
+    with pytest.raises(BadInputError) as caught:
+        validate(Values, document)
+    what = f"{document.values[key]!r} is invalid"
+    (problem,) = caught.value.problems
+    assert problem == documents.Problem(f"{file}:1", (key,), what, error["msg"])
+
+
+def test_a_number_with_its_unit_is_reported_with_the_unit_of_the_key(tmp_path: Path) -> None:
+    file = tmp_path / "values.yaml"
+    file.write_text("least_m: 45 mm")
     with pytest.raises(BadInputError) as caught:
         validate(Values, read_document(file))
-    assert [problem.remedy for problem in caught.value.problems] == [remedy]
+    (problem,) = caught.value.problems
+    assert problem.key == ("least_m",)
+    assert problem.remedy == "write a number in m, without the unit"
 
 
 def test_the_text_of_a_validator_is_shown_unchanged(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], va
         (("tolerances", "latency_s"), 35.0, "give at most 10 s; 35 ms are 0.035 s"),
         (("sheet", "max_stretch_ratio"), 8.0, "sheet.max_stretch_ratio: 8.0 is invalid; give at"),
         (("sheet", "young_modulus_pa"), 3e9, "sheet.min_stretch_ratio: 1.02 needs "),
-        (("object", "geometry", "radius_m"), -0.1, "give a value greater than 0 m"),
+        (("object", "geometry", "radius_m"), -0.1, "radius_m: -0.1 is invalid; "),
         (("projector", "width_px"), 2_000_000_000, "projector.width_px"),
         (("arms", "max_tool_speed_m_per_s"), 1e9, "arms.max_tool_speed_m_per_s"),
         (("camera", "right_from_left", 3, 3), 0.0, "the last row"),

@@ -14,8 +14,7 @@ from difflib import get_close_matches
 from functools import lru_cache
 from io import StringIO
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, Literal, Self, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
@@ -75,33 +74,6 @@ MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapp
 
 NUMBER_ERROR_TYPES = ("float_parsing", "float_type", "int_parsing", "int_type")
 """The types of pydantic errors for values that should be numbers."""
-
-LIMIT_REMEDIES = {
-    "greater_than": "give a value greater than {gt:g}",
-    "greater_than_equal": "give a value of at least {ge:g}",
-    "less_than": "give a value less than {lt:g}",
-    "less_than_equal": "give a value of at most {le:g}",
-}
-"""The remedy for each type of pydantic error about a limit, to which the unit is appended; names in
-braces are keys of the error's context."""
-
-REMEDIES = {
-    "finite_number": "write a finite number",
-    "int_from_float": "write an integer",
-    "literal_error": "write {expected}",
-    "enum": "write {expected}",
-    "union_tag_invalid": "write {expected_tags}",
-    "union_tag_not_found": "add the key {discriminator}",
-    "string_type": "write a text",
-    "bool_type": "write true or false",
-    "bool_parsing": "write true or false",
-    "list_type": "write a list",
-    "tuple_type": "write a list",
-    "path_type": "write the path of a file",
-    "too_short": "give {min_length} or more values",
-    "too_long": "give {max_length} or fewer values",
-}
-"""The remedy for each other type of pydantic error."""
 
 Key = tuple[str | int, ...]
 """The path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
@@ -471,16 +443,14 @@ def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
 
 def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Key) -> Problem:
     location: Key = tuple(error["loc"])
-    if error["type"] in ("extra_forbidden", "missing"):
-        name = location[-1]
-        inside, holder = _walk(model, location[:-1])
-        if error["type"] == "missing":
-            return document.problem((*at, *inside), f'"{name}" is missing', f'add "{name}"')
-        known = sorted(holder.model_fields) if _is_model(holder) else []
-        return document.problem(
-            (*at, *inside, name), f'unknown key "{name}"', did_you_mean(name, known)
-        )
-    key = _existing_part(document, (*at, *_walk(model, location)[0]))
+    name = location[-1] if location else ""
+    if error["type"] == "missing":
+        key = _find_key(document, (*at, *location[:-1]))
+        return document.problem(key, f'"{name}" is missing', f'add "{name}"')
+    key = _find_key(document, (*at, *location))
+    if error["type"] == "extra_forbidden":
+        known = _list_keys(model, location[:-1])
+        return document.problem(key, f'unknown key "{name}"', did_you_mean(name, known))
     if error["type"] in MAPPING_ERROR_TYPES:
         return document.problem(
             key, f"the value is {_name_type(error['input'])}", "write a mapping of keys and values"
@@ -491,66 +461,46 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 
 def describe_value_error(error: Any, name: str) -> tuple[str, str]:
     """Describe a pydantic error of the value `name`, and return the text and the remedy."""
-    what = f"{_shorten(error['input'])} is invalid"
-    unit = find_unit(name) if find_unit(name) != "1" else ""
-    if error["type"] in NUMBER_ERROR_TYPES:
-        return what, f"write a number in {unit}, without the unit" if unit else "write a number"
-    context = error.get("ctx", {})
-    if error["type"] in LIMIT_REMEDIES:
-        return what, f"{LIMIT_REMEDIES[error['type']].format(**context)} {unit}".rstrip()
-    if error["type"] in REMEDIES:
-        return what, REMEDIES[error["type"]].format(**context)
-    raised = context.get("error")
+    text = repr(error["input"])
+    what = f"{text if len(text) <= 60 else f'{text[:57]}...'} is invalid"
+    unit = find_unit(name)
+    if error["type"] in NUMBER_ERROR_TYPES and unit not in ("", "1"):
+        return what, f"write a number in {unit}, without the unit"
+    raised = error.get("ctx", {}).get("error")
     return what, str(raised) if isinstance(raised, Exception) else error["msg"]
 
 
-def _existing_part(document: Document, key: Key) -> Key:
-    """Return the longest prefix of `key` that exists in the document.
+def _find_key(document: Document, location: Key) -> Key:
+    """Return the parts of an error location from pydantic that are keys of the document.
 
-    `key` can be an error location from pydantic, which can contain names of types that are not keys
-    of the document.
+    The location of an error in a union also contains the name of the chosen member.
     """
+    key: list[str | int] = []
     values: Any = document.values
-    for number, part in enumerate(key):
+    for part in location:
         try:
             values = values[part]
         except (KeyError, IndexError, TypeError):
-            return key[:number]
-    return key
-
-
-def _shorten(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _walk(model: Any, location: Key) -> tuple[Key, Any]:
-    """Convert the location of a pydantic error into a key of the file.
-
-    Also return the type of the value at this key. If a type is a union, the location also contains
-    the name of the chosen member, which is not a key of the file.
-    """
-    key: list[str | int] = []
-    for part in location:
-        members = [one for one in get_args(model) if _is_model(one)] if _is_union(model) else []
-        chosen = next((one for one in members if _has_tag(one, part)), None)
-        if chosen is not None:
-            model = chosen
             continue
         key.append(part)
-        model = _inner_type(members[0] if len(members) == 1 else model, part)
-    if _is_union(model):
-        members = [one for one in get_args(model) if _is_model(one)]
-        model = members[0] if len(members) == 1 else None
-    return tuple(key), model
+    return tuple(key)
 
 
-def _is_model(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+def _list_keys(model: type[BaseModel], location: Key) -> list[str]:
+    """Return the keys that a model allows at the location of a pydantic error."""
+    models = [model]
+    for part in location:
+        found = [one.model_fields[str(part)] for one in models if part in one.model_fields]
+        inner = [one for field_info in found for one in _list_models(field_info.annotation)]
+        models = inner or [one for one in models if _has_tag(one, part)] or models
+    return sorted({name for one in models for name in one.model_fields})
 
 
-def _is_union(annotation: Any) -> bool:
-    return get_origin(annotation) in (Union, UnionType)
+def _list_models(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models in an annotation, such as the members of a union."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [one for inner in get_args(annotation) for one in _list_models(inner)]
 
 
 def _has_tag(model: type[BaseModel], tag: str | int) -> bool:
@@ -558,18 +508,6 @@ def _has_tag(model: type[BaseModel], tag: str | int) -> bool:
     return any(
         get_origin(one.annotation) is Literal and tag in get_args(one.annotation) for one in fields
     )
-
-
-def _inner_type(annotation: Any, part: str | int) -> Any:
-    if _is_model(annotation):
-        field_info = annotation.model_fields.get(part)
-        annotation = field_info.annotation if field_info is not None else None
-    else:
-        arguments = get_args(annotation)
-        annotation = arguments[-1] if arguments else None
-    while get_origin(annotation) is Annotated:
-        annotation = get_args(annotation)[0]
-    return annotation
 
 
 @contextmanager
