@@ -44,10 +44,20 @@ from flexsheet.launch.experiments import (
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import DEMO_FILE, run_experiment
-from flexsheet.launch.experiments.stroke import read_recording
+from flexsheet.launch.experiments.stroke import (
+    make_motion,
+    percentiles_ms,
+    read_recording,
+    summarize_sizes,
+)
 from flexsheet.launch.experiments.sweep import open_sweep, read_rows
-from flexsheet.launch.experiments.system_errors import APPROACH_S, STROKE, make_stroke
-from flexsheet.launch.experiments.system_run import evaluate_stroke
+from flexsheet.launch.experiments.system_errors import (
+    APPROACH_S,
+    STROKE,
+    make_stroke,
+    split_sheet_error,
+)
+from flexsheet.launch.experiments.trial import read_delays_s
 from flexsheet.launch.methods.results import describe_load, machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
 from flexsheet.launch.methods.system_chart import write_launch_file
@@ -55,7 +65,7 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import ArmState
+from flexsheet.messages.types import ArmState, SheetTarget
 from tests.lab_bags import Arm, Span, bags, measure_hold, read_arm, wanted
 
 SCENE_FILE = DEMO_FILE.parent / "scenes" / "cylinder.yaml"
@@ -146,6 +156,37 @@ def write_scene(name: str, level: float, target: Path) -> Path:
     with target.open("w") as output:
         yaml.dump(values, output)
     return target
+
+
+def evaluate_stroke(bag: Path) -> dict[str, Any]:
+    """Compute latencies, errors and lost messages of the finger stroke that a bag contains.
+
+    Latencies have quantiles p50, p95 and p99. Errors of sheet and fingertip have mean, p95 and max.
+    """
+    recording = read_recording(bag)
+    begin_ns, end_ns = recording.windows_ns[STROKE]
+    begin_ns += round(1e9 * APPROACH_S)
+    exposures = recording.finger.times_ns
+    inside = (exposures >= begin_ns) & (exposures <= end_ns)
+    for motion in (recording.fingertip, *recording.measured_edges, *recording.true_edges):
+        inside &= motion.covers(exposures)
+    times = exposures[inside]
+    rows = [
+        (message.valid_at_ns, np.array([message.normal_offset_m]))
+        for _, message, _, _ in BagReader(bag, topics=["sheet_target"])
+        if isinstance(message, SheetTarget)
+    ]
+    offsets_m = make_motion(rows, "sheet_target").interpolate(times)
+    errors = split_sheet_error(recording, offsets_m, times)
+    off_m = recording.fingertip.interpolate(times) - recording.finger.interpolate(times)
+    to_arm_s, to_light_s = read_delays_s(bag)
+    return {
+        "exposure_to_arm_ms": percentiles_ms(to_arm_s),
+        "exposure_to_light_ms": percentiles_ms(to_light_s),
+        "sheet_mm": summarize_sizes(1e3 * np.linalg.norm(errors.sum(axis=0), axis=1)),
+        "fingertip_mm": summarize_sizes(1e3 * np.linalg.norm(off_m, axis=1)),
+        "drops": recording.drops,
+    }
 
 
 def run_level(name: str, level: float, seconds: float, folder: Path) -> dict[str, Any]:

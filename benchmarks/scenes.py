@@ -28,7 +28,7 @@ from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.finger_paths import gesture_path
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import DEMO_FILE, require_scene
-from flexsheet.launch.experiments.system_run import read_cpu_s
+from flexsheet.launch.experiments.trial import read_cpu_s
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph

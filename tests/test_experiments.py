@@ -125,7 +125,6 @@ def make_recording(
     return stroke.StrokeRecording(
         scene=SCENE,
         fingertip=rest,
-        measured=rest,
         finger=rest,
         windows_ns=windows_ns,
         measured_edges=(rest, rest),

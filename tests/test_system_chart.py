@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
-from flexsheet.launch.experiments import stroke, sweep, system_errors, system_run
+from flexsheet.launch.experiments import stroke, sweep, system_errors
 from flexsheet.launch.experiments.sweep import TrialError
+from flexsheet.launch.experiments.trial import read_cpu_s
 from flexsheet.launch.experiments.true_geometry import place_edges
 from flexsheet.launch.methods import system_chart
 from flexsheet.launch.methods.system_chart import (
@@ -90,7 +91,6 @@ def make_recording(
     return stroke.StrokeRecording(
         scene=scene,
         fingertip=fixed(finger + np.array([offset_m, 0.0, 0.0])),
-        measured=fixed(finger),
         finger=fixed(finger),
         windows_ns={},
         measured_edges=edges(-control_m),
@@ -132,7 +132,7 @@ def test_the_stroke_stays_on_the_object_within_the_scenes_speed(name: str) -> No
 def test_processes_with_several_nodes_count_once() -> None:
     import os
 
-    found = system_run.read_cpu_s({"planner": os.getpid(), "bridge": os.getpid()})
+    found = read_cpu_s({"planner": os.getpid(), "bridge": os.getpid()})
     assert list(found) == ["bridge+planner"]
     assert found["bridge+planner"] > 0.0
 

@@ -69,7 +69,6 @@ def recording(pictures: stroke.DrawnFrames) -> stroke.StrokeRecording:
     return stroke.StrokeRecording(
         scene=SCENE,
         fingertip=finger,
-        measured=finger,
         finger=finger,
         windows_ns={stroke.stroke_label(SECONDS): (0, round(12.0 * 1e9))},
         measured_edges=edges,

@@ -19,6 +19,7 @@ from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     object_pose,
     sheet_errors,
+    summarize_sizes,
     summary,
 )
 from flexsheet.messages.apparatus import Apparatus
@@ -316,17 +317,10 @@ def summarize_path(
         "following_ratio": float(following[contact].mean()) if contact.any() else None,
         "drop_outs": len(np.unique(intervals)),
         "contact": {
-            "true_delta_d_mm": _summarize_sizes(1e3 * delta_d_m[contact]),
-            "true_delta_theta_deg": _summarize_sizes(np.degrees(delta_theta_rad[contact])),
+            "true_delta_d_mm": summarize_sizes(1e3 * delta_d_m[contact]),
+            "true_delta_theta_deg": summarize_sizes(np.degrees(delta_theta_rad[contact])),
         },
     }
-
-
-def _summarize_sizes(values: Floats) -> dict[str, float] | None:
-    if not len(values):
-        return None
-    p95 = float(np.quantile(values, 0.95))
-    return {"mean": float(values.mean()), "p95": p95, "max": float(values.max())}
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:

@@ -542,7 +542,6 @@ def record_in_simulated_time(
     return StrokeRecording(
         scene=scene,
         fingertip=measured,
-        measured=measured,
         finger=true,
         windows_ns={path.label: (int(samples.times_ns[0]), int(samples.times_ns[-1]))},
         measured_edges=reported,

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_smoothing_spline
 
 from flexsheet.launch.experiments import ExperimentError, find_recorded
 from flexsheet.launch.experiments.lag import estimate_lag_s
@@ -219,7 +218,7 @@ def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
 class StrokeRecording:
     """The data of a stroke experiment, read from a bag.
 
-    fingertip, measured, finger: filtered, measured and true position of the fingertip.
+    fingertip, finger: measured and true position of the fingertip.
     windows_ns: start and end (ns) of each finger path, by label of the path.
     measured_edges, true_edges: motion of the left and the right clamped edge of the sheet. Each row
         (9,) contains the centre, y axis and z axis of an edge in the world frame.
@@ -233,7 +232,6 @@ class StrokeRecording:
 
     scene: Scene
     fingertip: SampledMotion
-    measured: SampledMotion
     finger: SampledMotion
     windows_ns: dict[str, tuple[int, int]]
     measured_edges: tuple[SampledMotion, SampledMotion]
@@ -295,7 +293,6 @@ def read_recording(bag: Path) -> StrokeRecording:
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     fingertip: list[tuple[int, Floats]] = []
-    measured: list[tuple[int, Floats]] = []
     finger: list[tuple[int, Floats]] = []
     windows_ns: dict[str, tuple[int, int]] = {}
     flanges: dict[str, list[tuple[int, Floats]]] = {
@@ -315,7 +312,6 @@ def read_recording(bag: Path) -> StrokeRecording:
                 apparatus = message
             case Fingertip() if message.valid:
                 fingertip.append((header.source_ns, message.position_world_m))
-                measured.append((header.source_ns, message.measured_world_m))
             case TwinFinger():
                 finger.append((header.source_ns, message.position_world_m))
                 begin_ns = header.source_ns - round(message.path_time_s * 1e9)
@@ -353,7 +349,6 @@ def read_recording(bag: Path) -> StrokeRecording:
     return StrokeRecording(
         scene=scene,
         fingertip=make_motion(fingertip, "fingertip"),
-        measured=make_motion(measured, "fingertip"),
         finger=make_motion(finger, "twin/finger"),
         windows_ns=windows_ns,
         measured_edges=apply_compliance(
@@ -524,20 +519,6 @@ def sheet_errors(
     return np.linalg.norm(on_surface - presented_points, axis=1), np.abs(delta_theta)
 
 
-def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
-    """Smooth measured positions offline, from the first to the last of `times_ns`.
-
-    A cubic smoothing spline is fitted to each coordinate by generalized cross-validation. The
-    spline uses earlier and later measurements. A causal filter, which uses only earlier
-    measurements, is expected to have a larger error.
-    """
-    inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
-    times, values = measured.times_ns[inside], measured.values[inside]
-    seconds = (times - times[0]) * 1e-9
-    columns = [make_smoothing_spline(seconds, column)(seconds) for column in values.T]
-    return SampledMotion(times, np.column_stack(columns))
-
-
 def summary(values: Floats, scale: float) -> dict[str, float]:
     """Return mean, standard deviation and maximum of the values, multiplied by `scale`."""
     scaled = values * scale
@@ -548,17 +529,23 @@ def summary(values: Floats, scale: float) -> dict[str, float]:
     }
 
 
-def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
-    """Return the median and the 99 % quantile, in ms, of durations in s.
+def summarize_sizes(values: Floats) -> dict[str, float] | None:
+    """Return the mean, 95 % quantile and maximum of the values; None if there are no values."""
+    if len(values) == 0:
+        return None
+    p95 = float(np.quantile(values, 0.95))
+    return {"mean": float(values.mean()), "p95": p95, "max": float(values.max())}
 
-    Both are None if there are no durations.
+
+def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
+    """Return the median and the 95 % and 99 % quantiles, in ms, of durations in s.
+
+    They are None if there are no durations.
     """
     if len(values_s) == 0:
-        return {"p50": None, "p99": None}
-    return {
-        "p50": float(np.quantile(values_s, 0.5)) * 1e3,
-        "p99": float(np.quantile(values_s, 0.99)) * 1e3,
-    }
+        return dict.fromkeys(("p50", "p95", "p99"))
+    p50, p95, p99 = 1e3 * np.quantile(values_s, (0.5, 0.95, 0.99))
+    return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -568,14 +555,13 @@ class StrokeErrors:
     seconds: times (s) of the n exposures with a valid fingertip, since the start of the stroke. The
         measured errors belong to these times.
     true_seconds: times (s) of all k exposures, to which the true errors belong.
-    smoother_m, fingertip_m: (n,), errors of the offline smoother and of the fingertip.
+    fingertip_m: (n,), errors of the fingertip.
     arcs_m: (k, 2), arc lengths around the object to the true contact line and to the true finger.
     """
 
     seconds: Floats
     delta_d_m: Floats
     delta_theta_rad: Floats
-    smoother_m: Floats
     fingertip_m: Floats
     true_seconds: Floats
     true_delta_d_m: Floats
@@ -628,13 +614,11 @@ def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
     true_d, true_theta = sheet_errors(
         scene, recording.finger, recording.true_edges, exposures, surface=recording.true_surface
     )
-    smooth = smooth_motion(recording.measured, times)
     true_points = recording.finger.interpolate(times)
     return StrokeErrors(
         seconds=np.asarray((times - begin_ns) * 1e-9, dtype=np.float64),
         delta_d_m=delta_d,
         delta_theta_rad=delta_theta,
-        smoother_m=tangential_distance(scene, smooth.interpolate(times), true_points),
         fingertip_m=np.linalg.norm(recording.fingertip.interpolate(times) - true_points, axis=1),
         true_seconds=np.asarray((exposures - begin_ns) * 1e-9, dtype=np.float64),
         true_delta_d_m=true_d,
@@ -661,23 +645,9 @@ def compute_arcs(
     """
     planes = compute_sheet_planes(edges, object_pose(scene), times_ns)
     _, angles = find_presented_points(planes, np.zeros(len(points)))
-    both = np.stack([angles, _compute_angles(scene, points)], axis=1)
-    return np.asarray(require_cylinder(scene).radius_m * both)
-
-
-def _compute_angles(scene: Scene, points: Floats) -> Floats:
-    """Return the angles (n,), rad, of n world points (n, 3) around the axis of the object."""
     local = apply(inverse(object_pose(scene)), points)
-    return np.asarray(np.arctan2(local[:, 1], local[:, 2]))
-
-
-def tangential_distance(scene: Scene, points: Floats, others: Floats) -> Floats:
-    """Return the distances (n,), in m, between n pairs of points projected onto the cylinder.
-
-    points, others: (n, 3). Distances along the cylinder's axis are ignored.
-    """
-    angles = _compute_angles(scene, points) - _compute_angles(scene, others)
-    return np.asarray(2.0 * require_cylinder(scene).radius_m * np.abs(np.sin(0.5 * angles)))
+    both = np.stack([angles, np.arctan2(local[:, 1], local[:, 2])], axis=1)
+    return np.asarray(require_cylinder(scene).radius_m * both)
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
@@ -765,15 +735,12 @@ def stroke_result(
         "delta_theta_deg": summary(errors.delta_theta_rad, np.degrees(1.0)),
         "true_delta_d_mm": summary(errors.true_delta_d_m, 1e3),
         "true_delta_theta_deg": summary(errors.true_delta_theta_rad, np.degrees(1.0)),
-        "smoother_mm": summary(errors.smoother_m, 1e3),
-        "true_over_smoother": float(errors.true_delta_d_m.mean() / errors.smoother_m.mean()),
         "lag_ms": None if lag is None else 1e3 * lag,
         "visible_lag_ms": visible_lag_ms(recording, seconds),
         "fingertip_mm": summary(errors.fingertip_m, 1e3),
         "latency_ms": {
             "exposure_to_arm": summarize_delays(*ARM_EVENTS.values()),
             "exposure_to_frame": summarize_delays(LatencyEvent.FRAME_DRAWN),
-            "exposure_to_frame_begun": summarize_delays(LatencyEvent.FRAME_BEGUN),
             "exposure_to_light": summarize_delays(LatencyEvent.LIGHT),
         },
         "drops": recording.drops,

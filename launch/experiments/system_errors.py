@@ -30,6 +30,7 @@ from flexsheet.launch.experiments.stroke import (
     compute_sheet_planes,
     object_pose,
     project_presented_point,
+    summarize_sizes,
 )
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.messages.apparatus import Apparatus
@@ -164,8 +165,8 @@ class ErrorEvaluator:
         errors = split_sheet_error(recorded, np.zeros((len(times), 1)), times)
         off_m = np.linalg.norm(recorded.fingertip.values - recorded.finger.values, axis=1)
         return {
-            "sheet_mm": summarize_errors(1e3 * np.linalg.norm(errors.sum(axis=0), axis=1)),
-            "fingertip_mm": summarize_errors(1e3 * off_m),
+            "sheet_mm": summarize_sizes(1e3 * np.linalg.norm(errors.sum(axis=0), axis=1)),
+            "fingertip_mm": summarize_sizes(1e3 * off_m),
             "budget": dict(zip(STAGES, attribute_error(errors).tolist(), strict=True)),
         }
 
@@ -180,7 +181,7 @@ class ErrorEvaluator:
         maps = evaluator.evaluate(self.apparatus, frozenset({Metric.IMAGE})).image_m or ()
         sizes_mm = [1e3 * np.linalg.norm(one, axis=2).ravel() for one in maps]
         found = np.concatenate(sizes_mm)
-        return summarize_errors(found[np.isfinite(found)])
+        return summarize_sizes(found[np.isfinite(found)])
 
     def _force(self, methods: Methods) -> dict[str, float] | None:
         """Return the errors (%) of the felt force while the finger rests at several depths.
@@ -210,7 +211,7 @@ class ErrorEvaluator:
             errors += (
                 100.0 * np.abs(felt_n - wanted_n) / max(wanted_n, FORCE_JND_FLOOR_N)
             ).tolist()
-        return summarize_errors(np.array(errors))
+        return summarize_sizes(np.array(errors))
 
 
 class RestingPush:
@@ -324,14 +325,3 @@ def attribute_error(parts: Floats) -> Floats:
     if total == 0.0:
         return np.zeros(len(parts))
     return np.asarray(np.einsum("knd,nd->k", parts, whole) / total)
-
-
-def summarize_errors(values: Floats) -> dict[str, float] | None:
-    """Return the mean, 95 % quantile and maximum of the values; None if there are no values."""
-    if len(values) == 0:
-        return None
-    return {
-        "mean": float(values.mean()),
-        "p95": float(np.quantile(values, 0.95)),
-        "max": float(values.max()),
-    }

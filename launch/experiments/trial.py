@@ -9,13 +9,18 @@ import json
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import psutil
+
 from flexsheet.launch.commands.output import logs_on_stderr
 from flexsheet.launch.experiments import stroke
+from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.offline import Metric, OfflineEvaluator, exceeded_tolerances
 from flexsheet.launch.experiments.ports import choose_ports
@@ -25,8 +30,12 @@ from flexsheet.launch.experiments.run import (
     run_experiment,
 )
 from flexsheet.launch.experiments.simulated_time import LoopSettings, stroke_in_simulated_time
-from flexsheet.launch.experiments.system_errors import ErrorEvaluator
-from flexsheet.launch.experiments.system_run import run_system
+from flexsheet.launch.experiments.system_errors import (
+    APPROACH_S,
+    STROKE,
+    ErrorEvaluator,
+    make_stroke,
+)
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
@@ -34,8 +43,10 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import Methods
 from flexsheet.messages.scene import Scene, require_cylinder
-from flexsheet.messages.types import Status, SuspectedCause
+from flexsheet.messages.types import Frame, Status, SuspectedCause, TwinFinger
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
+from flexsheet.nodes.twin.truth import find_display_delay_s
 
 Row = dict[str, Any]
 
@@ -246,12 +257,88 @@ def _mean_stroke_errors(
     }
 
 
+def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
+    """Return the processor time (s) of each process, including its ended child processes.
+
+    Nodes that share a process have one entry. Its key contains their names, joined by "+".
+
+    pids: process id of each node.
+    """
+    names: dict[int, list[str]] = {}
+    for name, pid in pids.items():
+        names.setdefault(pid, []).append(name)
+    used: dict[str, float] = {}
+    for pid, together in names.items():
+        try:
+            times = psutil.Process(pid).cpu_times()
+        except psutil.NoSuchProcess:
+            continue
+        total = times.user + times.system + times.children_user + times.children_system
+        used["+".join(sorted(together))] = total
+    return used
+
+
 def run_system_trial(trial: Mapping[str, Any]) -> Row:
-    """Run one configuration of the graph, and return its processor use and latencies."""
-    launch_file = Path(trial["launch_file"])
+    """Run a configuration of the graph during a stroke; return processor use and latencies (ms).
+
+    A latency is None if the graph does not have the corresponding output.
+    """
+    launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
     settings = [*choose_ports(launch_file), *trial["settings"]]
+    cores: dict[str, float] = {}
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        _tell(f"stroke for {seconds:g} s")
+        before, start_s = read_cpu_s(driver.pids()), time.monotonic()
+        await driver.follow(make_stroke(scene, seconds))
+        after, passed_s = read_cpu_s(driver.pids()), time.monotonic() - start_s
+        for name in before.keys() & after.keys():
+            cores[name] = (after[name] - before[name]) / passed_s
+
     with _bag_of(trial) as bag:
-        return run_system(launch_file, settings, bag, float(trial["seconds"]), _tell)
+        run_experiment(launch_file, settings, bag, procedure, _tell)
+        to_arm_s, to_light_s = read_delays_s(bag)
+    return {
+        "cpu_cores": sum(cores.values()),
+        "cpu_cores_by_node": dict(sorted(cores.items())),
+        "exposure_to_arm_ms": stroke.percentiles_ms(to_arm_s) if len(to_arm_s) else None,
+        "exposure_to_light_ms": stroke.percentiles_ms(to_light_s) if len(to_light_s) else None,
+    }
+
+
+def read_delays_s(bag: Path) -> tuple[Floats, Floats]:
+    """Return the delays (s) from exposures to arm commands, and from exposures to displayed images.
+
+    Only exposures during the stroke are used. If an exposure causes several commands of the same
+    arm or several images, only the first is used. The display times are corrected by the true
+    latency of the projector.
+    """
+    window_ns = 0, 0
+    for _, message, header, _ in BagReader(bag, topics=["twin/finger"]):
+        if isinstance(message, TwinFinger) and message.path_label == STROKE:
+            zero_ns = header.source_ns - round(1e9 * message.path_time_s)
+            window_ns = zero_ns + round(1e9 * APPROACH_S), header.source_ns
+    to_arm: dict[tuple[str, int], float] = {}
+    to_light: dict[int, float] = {}
+    apparatus: Apparatus | None = None
+    frame: Frame | None = None
+    for _, message, header, _ in BagReader(
+        bag, topics=("twin/apparatus", "arm_left", "arm_right", "frame")
+    ):
+        if isinstance(message, Apparatus):
+            apparatus = message
+        elif isinstance(message, Frame):
+            frame = message
+        for event, exposure_ns, at_ns in stroke.list_events(message, header):
+            if window_ns[0] <= exposure_ns <= window_ns[1]:
+                delay_s = 1e-9 * (at_ns - exposure_ns)
+                if event is stroke.LatencyEvent.LIGHT:
+                    to_light.setdefault(exposure_ns, delay_s)
+                elif event in stroke.ARM_EVENTS.values():
+                    to_arm.setdefault((event, exposure_ns), delay_s)
+    return np.array(list(to_arm.values())), (
+        np.array(list(to_light.values())) + find_display_delay_s(frame, apparatus)
+    )
 
 
 def run_system_errors_trial(trial: Mapping[str, Any]) -> Row:

@@ -1,6 +1,6 @@
 """Measure the speed and accuracy of the whole system for several configurations of its methods.
 
-Processor use and latency are measured in the running graph (`experiments/system_run.py`). The
+Processor use and latency are measured in the running graph (`experiments/trial.py`). The
 measurement is repeated in blocks, each with a run of every configuration in random order, so that
 slow changes of the computer affect all configurations equally. Results are medians over blocks,
 with bootstrap confidence intervals over whole blocks, because the runs of a block are not
