@@ -125,9 +125,7 @@ def contains_stop(bag: Path) -> bool:
 def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a complete bag of the small graph."""
     folder = tmp_path_factory.mktemp("recorded")
-    launched = Launched(
-        write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=5.0"
-    )
+    launched = Launched(write(folder, GRAPH), "--record", folder / "a.mcap")
     # The listener hears the tenth beat a fifth of a second after the start, and says so by and by.
     wait_until(lambda: contains_stop(folder / "a.mcap"), "the listener's stop in the bag")
     assert launched.stop() == 0

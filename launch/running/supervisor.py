@@ -305,7 +305,9 @@ class RunningGraph:
             self._report(LAUNCHER, f"{omitted.name} is not started: {REASON_TEXTS[omitted.reason]}")
         if problem := describe_priority_problem(self.nodes):
             self._report(LAUNCHER, problem)
-        for name, process in self._processes.items():
+        for name, process in sorted(
+            self._processes.items(), key=lambda item: not _records(item[1])
+        ):
             self._supervisors[name] = asyncio.create_task(self._supervise(process), name=name)
 
     def publish_scene(self, scene: Scene) -> int:
@@ -347,6 +349,8 @@ class RunningGraph:
         policy, name = process.settings.restart, process.name
         recent: deque[float] = deque()
         loop = asyncio.get_running_loop()
+        if not _records(process):
+            await self._wait_for_recorders()
         while True:
             problem = await self._run_once(process)
             if policy.policy == "never" or (policy.policy == "on_failure" and problem is None):
@@ -370,6 +374,14 @@ class RunningGraph:
             await asyncio.sleep(delay_s)
             for node in process.nodes:
                 self.restarts[node.name] += 1
+
+    async def _wait_for_recorders(self) -> None:
+        """Wait until each recorder is ready or has ended, so that bags contain all messages."""
+        for name, process in self._processes.items():
+            if _records(process):
+                child = self._children[name]
+                started: set[asyncio.Future[Any]] = {child.ready, child.exited}
+                await asyncio.wait(started, return_when=asyncio.FIRST_COMPLETED)
 
     async def _run_once(self, process: ResolvedProcess) -> str | None:
         """Run a process until it ends; return a text about its failure, or None if it succeeded."""
@@ -503,6 +515,10 @@ def _own_module_folders(node_types: Iterable[str]) -> list[str]:
     names = {one.partition(":")[0].partition(".")[0] for one in node_types if ":" in one}
     is_own = any((script / f"{one}.py").is_file() or (script / one).is_dir() for one in names)
     return [str(script)] if is_own else []
+
+
+def _records(process: ResolvedProcess) -> bool:
+    return any(node.role is NodeRole.RECORDER for node in process.nodes)
 
 
 def _only_reads(node: ResolvedNode) -> bool:
