@@ -47,7 +47,6 @@ WITHOUT_GPU = (
 )
 DEADLINE_MS = 180_000.0
 
-PATH_LABEL = "stroke and push"
 TOPICS = ("scene", "skin", "soft_body", "fingertip", "arm_left", "arm_right")
 KNOTS = (
     # time (s), along the axis (m), angle from the front (rad), depth (m)
@@ -83,7 +82,7 @@ def finger_path(scene: Scene, number: int) -> FingerPath:
         [knots[:, 1], distance_m * np.sin(knots[:, 2]), distance_m * np.cos(knots[:, 2])]
     )
     return FingerPath(
-        label=f"{PATH_LABEL} {number}",
+        label=f"stroke and push {number}",
         times_s=knots[:, 0],
         positions_world_m=apply(object_pose(scene), points),
         wander_m=0.0,
@@ -108,15 +107,14 @@ async def open_page(url: str, size_px: tuple[int, int]) -> AsyncIterator[Page]:
         chromium = await play.chromium.launch(
             executable_path=str(CHROMIUM), args=list(WITHOUT_GPU), timeout=DEADLINE_MS
         )
-        width, height = size_px
-        page = await chromium.new_page(viewport={"width": width, "height": height})
+        page = await chromium.new_page(viewport={"width": size_px[0], "height": size_px[1]})
         page.set_default_timeout(DEADLINE_MS)
         await page.goto(url)
         yield page
         await chromium.close()
 
 
-async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) -> None:
+async def animate(bag: Path, output: Path) -> None:
     """Draw the last pass of the finger in a bag as an animated WebP."""
     *_, start_ns = (time_ns for *_, time_ns in BagReader(bag, topics=["twin/finger_path"]))
     entries = iter(BagReader(bag, topics=TOPICS))
@@ -149,7 +147,7 @@ async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) 
         client = await joined
         client.camera.position, client.camera.look_at = POSITION_M, TARGET_M
         client.camera.up_direction, client.camera.fov = (0.0, 1.0, 0.0), FOV_RAD
-        times_s = np.arange(0.0, PATH_S, 1.0 / frames_per_s)
+        times_s = np.arange(0.0, PATH_S, 1.0 / FRAMES_PER_S)
         # The page loads meshes and fonts while it draws the first frames.
         for seconds in (*np.zeros(WARM_UP_FRAMES), *times_s):
             read_until(start_ns + 1e9 * seconds)
@@ -164,7 +162,7 @@ async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) 
         output,
         save_all=True,
         append_images=frames[1:],
-        duration=round(1000 / frames_per_s),
+        duration=round(1000 / FRAMES_PER_S),
         loop=0,
         quality=WEBP_QUALITY,
         method=6,
@@ -178,13 +176,6 @@ def on_white(drawn: NDArray[np.uint8]) -> Image.Image:
     return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
 
 
-async def slide(page: Page, label: str, value: float) -> None:
-    """Enter a number beside a slider of the page."""
-    box = page.get_by_role("textbox", name=label)
-    await box.fill(f"{value:g}")
-    await box.press("Enter")
-
-
 async def photograph() -> None:
     """Save an image of the page of a running graph."""
     # The page needs most of the processor time of a computer without a graphics card.
@@ -196,7 +187,9 @@ async def photograph() -> None:
         await graph.wait_ready(DEADLINE_MS / 1e3)
         async with open_page(url, PAGE_PX) as page:
             await dismiss_notice(page)
-            await slide(page, "Push, mm", 12)
+            push = page.get_by_role("textbox", name="Push, mm")
+            await push.fill("12")
+            await push.press("Enter")
             await expect(page.get_by_role("status")).to_contain_text("following")
             await expect(page.get_by_text("pushes 1")).to_be_visible()
             await page.screenshot(path=IMAGES / "console.png")
@@ -211,18 +204,22 @@ async def dismiss_notice(page: Page) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bag", type=Path, help="bag of an earlier run of this command")
+    parser.add_argument(
+        "--bag",
+        type=Path,
+        help="bag of the finger's path, which is recorded if the file does not exist",
+    )
     parser.add_argument("--animation", action="store_true", help="make the animation only")
     parser.add_argument("--page", action="store_true", help="make the image of the page only")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
-        bag = given.bag or Path(folder) / "touch.mcap"
-        if given.bag is None or not bag.exists():
-            record(bag)
-        if not given.page:
+    if not given.page:
+        with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
+            bag = given.bag or Path(folder) / "touch.mcap"
+            if not bag.exists():
+                record(bag)
             asyncio.run(animate(bag, IMAGES / "console.webp"))
-        if not given.animation:
-            asyncio.run(photograph())
+    if not given.animation:
+        asyncio.run(photograph())
 
 
 if __name__ == "__main__":

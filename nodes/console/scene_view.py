@@ -52,7 +52,9 @@ NAME_ABOVE_M = np.array([0.0, 0.05, 0.0])
 FLOOR_M = 0.02
 """The distance of the drawn floor below the bases of the arms."""
 
-DEVICE_FOV_RAD, DEVICE_SCALE = 0.6, 0.06
+CAMERA_SIZE_M, PROJECTOR_SIZE_M = (0.035, 0.045), (0.16, 0.07, 0.12)
+"""The size of the drawn housings. The width of the camera follows from its baseline."""
+
 CAMERA_POSITION_M, CAMERA_TARGET_M = (0.5, 0.34, 1.3), (0.0, -0.13, 0.0)
 
 Drag = Callable[[Floats, Floats], None]
@@ -224,23 +226,18 @@ class SceneView:
         )
 
     def _add_devices(self, scene: Scene) -> None:
-        left = pose_matrix(scene.camera.world_from_left)
         baseline_m = -float(scene.camera.right_from_left[0, 3])
-        right = left @ transform(np.eye(3), (baseline_m, 0.0, 0.0))
-        devices = {"left camera": left, "right camera": right}
+        between_m = transform(np.eye(3), (0.5 * baseline_m, 0.0, 0.0))
+        camera = pose_matrix(scene.camera.world_from_left) @ between_m
+        devices = [("stereo camera", camera, (baseline_m + 0.05, *CAMERA_SIZE_M))]
         if scene.projector is not None:
-            devices["projector"] = pose_matrix(scene.projector.world_from_projector)
-        for name, pose in devices.items():
-            position, wxyz = _pose(pose)
-            self._scene.add_camera_frustum(
-                f"/devices/{name}",
-                DEVICE_FOV_RAD,
-                1.5,
-                scale=DEVICE_SCALE,
-                color=DEVICE,
-                wxyz=wxyz,
-                position=position,
-            )
+            projector = pose_matrix(scene.projector.world_from_projector)
+            devices.append(("projector", projector, PROJECTOR_SIZE_M))
+        for name, pose, size_m in devices:
+            # The lenses are at the front of the housing.
+            centre = pose @ transform(np.eye(3), (0.0, 0.0, -0.5 * size_m[2]))
+            position, wxyz = _pose(centre)
+            self._scene.add_box(f"/devices/{name}", DEVICE, size_m, wxyz=wxyz, position=position)
             self._add_name(f"/names/{name}", name, position + NAME_ABOVE_M)
         half = np.array([0.5 * scene.eyes.interocular_m, 0.0, 0.0])
         for name, sign in (("left", -1.0), ("right", 1.0)):
