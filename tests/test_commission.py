@@ -23,6 +23,13 @@ from flexsheet.launch.calibration.commission import (
     VerificationError,
     list_doubts,
 )
+from flexsheet.launch.calibration.commission_steps import (
+    BOARD,
+    INSTRUCTIONS,
+    Laboratory,
+    describe_sheet,
+    open_laboratory,
+)
 from flexsheet.launch.calibration.delays import DelaysError, MeasuredLag, read_measured_lags
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CornerView, calibrate_base
 from flexsheet.launch.calibration.prediction import Knowledge, PredictedError, draw_apparatus
@@ -31,13 +38,6 @@ from flexsheet.launch.calibration.touches import simulate_touches
 from flexsheet.launch.commands import capture
 from flexsheet.launch.commands.calibrate_rows import make_marker_calibration as fit_marker
 from flexsheet.launch.commands.calibrate_rows import make_sheet_calibration as fit_sheet
-from flexsheet.launch.commands.commission_steps import (
-    BOARD,
-    INSTRUCTIONS,
-    Laboratory,
-    describe_sheet,
-    open_laboratory,
-)
 from flexsheet.launch.commands.output import NOT_GOOD
 from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
@@ -648,7 +648,7 @@ def test_real_devices_stop_at_the_first_step_without_data(
 ) -> None:
     predicted = {"image_mm": PredictedError(**PREDICTED)}
     monkeypatch.setattr(
-        "flexsheet.launch.calibration.prediction.predict_errors", lambda *_: predicted
+        "flexsheet.launch.calibration.commission_steps.predict_errors", lambda *_: predicted
     )
     folder = ("--output", str(tmp_path / "lab"))
     code, found, _ = invoke(*folder)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexsheet.launch.calibration.commission import StepName, list_doubts
+from flexsheet.launch.calibration.commission import StepName, list_doubts, summarize
+from flexsheet.launch.calibration.commission_steps import open_laboratory
 from flexsheet.launch.calibration.delays import MeasuredDelays, MeasuredLag
 from flexsheet.launch.calibration.display_latency import (
     MIN_SWITCHES,
@@ -20,8 +21,6 @@ from flexsheet.launch.calibration.display_latency import (
     read_switch_images,
     simulate_switch_images,
 )
-from flexsheet.launch.commands.commission import summarize
-from flexsheet.launch.commands.commission_steps import open_laboratory
 from flexsheet.launch.experiments.run import SWITCH_INTERVAL_S
 from flexsheet.launch.plans.documents import edit_yaml
 from flexsheet.launch.plans.plan import load_graph, load_scene
@@ -189,7 +188,7 @@ def test_the_latency_goes_to_the_renderer_in_a_common_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str, added_s: float
 ) -> None:
     """A window shows a frame for 1/30 s; the bag already contains a part of the stamp offset."""
-    calibration = "flexsheet.launch.calibration"
+    steps = "flexsheet.launch.calibration.commission_steps"
     demo = SCENE_FILE.parent.parent / "demo.yaml"
     with edit_yaml(demo, tmp_path / "launch.yaml") as tree:
         tree["scene"] = str(SCENE_FILE)
@@ -199,7 +198,7 @@ def test_the_latency_goes_to_the_renderer_in_a_common_clock(
     (tmp_path / "stroke.mcap").touch()
     servo: dict[Side, MeasuredLag] = {"left": MeasuredLag(0.04, 1e-3)}
     delays = MeasuredDelays(servo, MeasuredLag(0.004, 2e-4))
-    monkeypatch.setattr(f"{calibration}.delays.read_delays", lambda *_: delays)
+    monkeypatch.setattr(f"{steps}.read_delays", lambda *_: delays)
     images = switch(0.020)
 
     def read(_: Path, offset_s: float) -> list[SwitchImage]:
@@ -208,7 +207,7 @@ def test_the_latency_goes_to_the_renderer_in_a_common_clock(
             for one in images
         ]
 
-    monkeypatch.setattr(f"{calibration}.display_latency.read_switch_images", read)
+    monkeypatch.setattr(f"{steps}.read_switch_images", read)
     lab, devices = open_laboratory(
         tmp_path / "lab",
         tmp_path / "launch.yaml",

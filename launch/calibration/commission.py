@@ -332,6 +332,32 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
+def summarize(lab: Commissioning) -> dict[str, Any]:
+    """Return the state of a laboratory's calibration for `flexsheet commission --json`."""
+    steps = []
+    for record in (lab.state.steps[name] for name in StepName if name in lab.state.steps):
+        row = dict.fromkeys(("residual", "unit", "limit", "within_limit", "advice"))
+        row |= {"uncertainty": {}, "missing": []}
+        if (result := record.result) is not None:
+            shown = {"residual", "unit", "limit", "uncertainty", "missing"}
+            row = result.model_dump(mode="json", include=shown)
+            row["within_limit"] = result.within_limit
+            row["advice"] = None if result.within_limit else result.advice
+        shown = {"name", "seconds", "cpu_seconds", "skipped_because"}
+        steps.append({**record.model_dump(mode="json", include=shown), **row})
+    verified = lab.state.steps.get(StepName.VERIFICATION)
+    found = None if verified is None or verified.result is None else verified.result.figures
+    apparatus = lab.folder / APPARATUS_FILE
+    return {
+        "launch_file": str(lab.launch_copy),
+        "scene_file": str(lab.scene_copy),
+        "apparatus": str(apparatus) if apparatus.exists() else None,
+        "steps": steps,
+        "verification": found or {},
+        "complete": not lab.pending(),
+    }
+
+
 def _verification_figures(state: State) -> Mapping[str, Any]:
     record = state.steps.get(StepName.VERIFICATION)
     return {} if record is None or record.result is None else record.result.figures

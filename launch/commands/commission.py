@@ -127,8 +127,8 @@ def commission(
     if the verification has found a problem.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName, is_good
+    from flexsheet.launch.calibration.commission_steps import open_laboratory
     from flexsheet.launch.commands.calibrate import FOUR_BITS, parse_board
-    from flexsheet.launch.commands.commission_steps import open_laboratory
 
     given = {name: Path(path) for name, path in _parse_pairs("--data", data).items()}
     skips = _parse_pairs("--skip", skipped)
@@ -191,36 +191,8 @@ def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
     return pairs
 
 
-def summarize(lab: Commissioning) -> dict[str, Any]:
-    """Return the state of a laboratory's calibration for `flexsheet commission --json`."""
-    from flexsheet.launch.calibration.commission import APPARATUS_FILE, StepName
-
-    steps = []
-    for record in (lab.state.steps[name] for name in StepName if name in lab.state.steps):
-        row = dict.fromkeys(("residual", "unit", "limit", "within_limit", "advice"))
-        row |= {"uncertainty": {}, "missing": []}
-        if (result := record.result) is not None:
-            shown = {"residual", "unit", "limit", "uncertainty", "missing"}
-            row = result.model_dump(mode="json", include=shown)
-            row["within_limit"] = result.within_limit
-            row["advice"] = None if result.within_limit else result.advice
-        shown = {"name", "seconds", "cpu_seconds", "skipped_because"}
-        steps.append({**record.model_dump(mode="json", include=shown), **row})
-    verified = lab.state.steps.get(StepName.VERIFICATION)
-    found = None if verified is None or verified.result is None else verified.result.figures
-    apparatus = lab.folder / APPARATUS_FILE
-    return {
-        "launch_file": str(lab.launch_copy),
-        "scene_file": str(lab.scene_copy),
-        "apparatus": str(apparatus) if apparatus.exists() else None,
-        "steps": steps,
-        "verification": found or {},
-        "complete": not lab.pending(),
-    }
-
-
 def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
-    from flexsheet.launch.calibration.commission import format_verdict
+    from flexsheet.launch.calibration.commission import format_verdict, summarize
 
     result = summarize(lab)
     if as_json:

@@ -153,8 +153,8 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
     The verification runs in simulated time, without a graph. Its result also contains the predicted
     errors, and whether the laboratory's own report rates the result as good.
     """
-    from flexsheet.launch.commands.commission import summarize
-    from flexsheet.launch.commands.commission_steps import open_laboratory
+    from flexsheet.launch.calibration.commission import summarize
+    from flexsheet.launch.calibration.commission_steps import open_laboratory
 
     os.setpriority(os.PRIO_PROCESS, 0, max(os.getpriority(os.PRIO_PROCESS, 0), NICENESS))
     folder, base = Path(trial["commission_folder"]), Path(trial["launch_file"])

@@ -13,10 +13,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from flexsheet.launch.bags.report import BRIEFLY_BUSY_FRACTION
+from flexsheet.launch.calibration.capture import Capture
 from flexsheet.launch.calibration.commission import (
     APPARATUS_FILE,
     CommissionError,
@@ -30,6 +32,34 @@ from flexsheet.launch.calibration.commission import (
     VerificationError,
     list_doubts,
 )
+from flexsheet.launch.calibration.delays import MeasuredLag, measure_in_simulation, read_delays
+from flexsheet.launch.calibration.display_latency import (
+    DisplayLatencyError,
+    estimate_display_latency,
+    read_switch_images,
+    simulate_switch_images,
+)
+from flexsheet.launch.calibration.edge_fit import fit_edges
+from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
+from flexsheet.launch.calibration.eyes import fit_eyes, read_alignments, simulate_alignments
+from flexsheet.launch.calibration.gray_code import make_patterns
+from flexsheet.launch.calibration.prediction import (
+    EYE_STD_M,
+    SHEET_MASS_STD_RATIO,
+    STAMP_STD_S,
+    Knowledge,
+    predict_errors,
+)
+from flexsheet.launch.calibration.projector import (
+    calibrate_projector as fit_projector,
+)
+from flexsheet.launch.calibration.projector import (
+    measure_points,
+)
+from flexsheet.launch.calibration.sheet_fit import MAX_RMS_SIGMAS
+from flexsheet.launch.calibration.sheet_rows import read_rows
+from flexsheet.launch.calibration.stereo import calibrate_stereo
+from flexsheet.launch.calibration.touches import read_touches, simulate_touches
 from flexsheet.launch.commands import (
     calibrate,
     calibrate_arms,
@@ -37,8 +67,18 @@ from flexsheet.launch.commands import (
     calibrate_rows,
     capture,
 )
+from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+from flexsheet.launch.experiments.offline import (
+    MOVING_METRICS,
+    OfflineEvaluator,
+    exceeded_tolerances,
+)
+from flexsheet.launch.experiments.run import require_scene
+from flexsheet.launch.experiments.simulated_time import LoopSettings, stroke_in_simulated_time
 from flexsheet.launch.plans.apparatus import format_apparatus
 from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import (
     Board,
@@ -48,11 +88,6 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.nodes.models.sheet.tension import edge_force_n
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-if TYPE_CHECKING:
-    from flexsheet.launch.calibration.delays import MeasuredLag
-    from flexsheet.launch.calibration.prediction import Knowledge
-    from flexsheet.launch.plans.plan_model import ResolvedGraph
 
 STEREO, ARMS, SHEET, MARKER = "stereo.yaml", "arms.yaml", "sheet.yaml", "marker.yaml"
 BOARD = Board(kind="chessboard", columns=9, rows=6, square_m=0.025)
@@ -188,8 +223,6 @@ class Laboratory:
         return load_scene(lab.scene_copy), calibration
 
     def calibrate_camera(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.capture import Capture
-        from flexsheet.launch.calibration.stereo import calibrate_stereo
 
         scene = load_scene(lab.scene_copy)
         camera = scene.camera
@@ -264,8 +297,6 @@ class Laboratory:
         )
 
     def calibrate_sheet(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.sheet_fit import MAX_RMS_SIGMAS, SheetModelFitError
-        from flexsheet.launch.calibration.sheet_rows import read_rows
 
         scene = load_scene(lab.scene_copy)
         if self.apparatus is None:
@@ -278,12 +309,7 @@ class Laboratory:
             true = apply_apparatus(scene, self.apparatus).sheet
             weighing = np.random.default_rng([self.seed, 3]).normal(1.0, WEIGHING_RATIO)
             mass_kg_per_m2 = float(true.density_kg_per_m3 * true.thickness_m * weighing)
-        try:
-            found = calibrate_rows.make_sheet_calibration(scene, pushes, lines, source=source)
-        except SheetModelFitError as error:
-            raise CommissionError(
-                f"the sheet cannot be calibrated with the data of {source}: {error}"
-            ) from error
+        found = calibrate_rows.make_sheet_calibration(scene, pushes, lines, source=source)
         modulus, width_m = found.modulus_thickness_n_per_m, round(found.slack_width_m.value, 6)
         wider = width_m / scene.sheet.width_m
         # Stretch ratios refer to the width of the scene, which becomes the measured one.
@@ -314,14 +340,6 @@ class Laboratory:
         )
 
     def calibrate_projector(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.gray_code import make_patterns
-        from flexsheet.launch.calibration.projector import (
-            ProjectorError,
-            measure_points,
-        )
-        from flexsheet.launch.calibration.projector import (
-            calibrate_projector as fit_projector,
-        )
 
         scene = load_scene(lab.scene_copy)
         guess = require_projector(scene)
@@ -337,11 +355,7 @@ class Laboratory:
                     scene, true, self.apparatus, self.sheet_poses, self.seed
                 )
             )
-        try:
-            points = measure_points(views, camera, guess)
-            fit = fit_projector(points, guess)
-        except ProjectorError as error:
-            raise CommissionError(f"step projector: {error}") from error
+        fit = fit_projector(measure_points(views, camera, guess), guess)
         return StepResult(
             residual=fit.rms_px,
             unit="px",
@@ -356,18 +370,13 @@ class Laboratory:
         )
 
     def calibrate_edges(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
-        from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
 
         scene, optics = self._load(lab)
         if self.apparatus is None:
             poses = read_edge_marks(self._find_data(StepName.EDGES))
         else:
             poses = simulate_edge_marks(scene, self.apparatus, calibration=optics, seed=self.seed)
-        try:
-            fits = fit_edges(poses, scene)
-        except EdgeFitError as error:
-            raise CommissionError(f"step edges: {error}; {error.remedy}") from error
+        fits = fit_edges(poses, scene)
         uncertainty = {}
         for side, fit in fits.items():
             uncertainty[f"{side}_edge_mm"] = 1e3 * fit.edge_std_m
@@ -383,7 +392,6 @@ class Laboratory:
         )
 
     def calibrate_marker(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.touches import read_touches, simulate_touches
 
         scene, optics = self._load(lab)
         radius_m = self.finger_radius_m
@@ -414,7 +422,6 @@ class Laboratory:
         )
 
     def calibrate_eyes(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.eyes import fit_eyes, read_alignments, simulate_alignments
 
         scene, optics = self._load(lab)
         if self.apparatus is None:
@@ -450,9 +457,6 @@ class Laboratory:
         )
 
     def measure_delays(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.delays import measure_in_simulation, read_delays
-        from flexsheet.launch.calibration.display_latency import DisplayLatencyError
-        from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
         scene, optics = self._load(lab)
         graph, added_s = load_graph(lab.launch_copy), 0.0
@@ -510,13 +514,6 @@ class Laboratory:
         added_s: offset (s) by which the timestamps in the data have already been corrected. Only
             the difference between `stamp` and this offset is still corrected.
         """
-        from flexsheet.launch.calibration.delays import MeasuredLag
-        from flexsheet.launch.calibration.display_latency import (
-            estimate_display_latency,
-            read_switch_images,
-            simulate_switch_images,
-        )
-        from flexsheet.launch.calibration.prediction import STAMP_STD_S
 
         stamp = stamp or MeasuredLag(added_s, STAMP_STD_S)
         offset_s = stamp.lag_s - added_s
@@ -541,8 +538,6 @@ class Laboratory:
         The errors are measured during a stroke of the finger. In a simulated laboratory, they are
         also measured with a resting finger.
         """
-        from flexsheet.launch.bags.report import BRIEFLY_BUSY_FRACTION
-        from flexsheet.launch.calibration.prediction import predict_errors
 
         scene = load_scene(lab.scene_copy)
         if self.apparatus is None:
@@ -571,13 +566,6 @@ class Laboratory:
 
 def collect_knowledge(lab: Commissioning) -> Knowledge:
     """Collect the calibrations and covariances that are needed to predict errors."""
-    from flexsheet.launch.calibration.prediction import (
-        EYE_STD_M,
-        SHEET_MASS_STD_RATIO,
-        STAMP_STD_S,
-        Knowledge,
-    )
-    from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
     covariances: dict[StepName, dict[str, Any]] = {
         name: {key: np.array(one) for key, one in record.result.covariances.items()}
@@ -610,15 +598,6 @@ def run_verification(
 
     Raises VerificationError if the stroke fails.
     """
-    from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
-    from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
-    from flexsheet.launch.experiments.offline import (
-        MOVING_METRICS,
-        OfflineEvaluator,
-        exceeded_tolerances,
-    )
-    from flexsheet.launch.experiments.run import require_scene
-    from flexsheet.launch.experiments.simulated_time import LoopSettings, stroke_in_simulated_time
     from flexsheet.launch.experiments.trial import run_stroke
 
     file = str(lab.folder / APPARATUS_FILE)
