@@ -92,7 +92,7 @@ def test_the_demo_ends_with_the_files_and_what_they_show(
     def run_short(
         file: Path, given: object, bag: Path, progress: Any, report: demo.Report, **_: object
     ) -> None:
-        report(demo.DemoResult(figures=[demo.DemoFigure(bag.parent / "latency.png", "delays")]))
+        report(demo.DemoResult(figures=[demo.DemoFigure(bag.parent / "stroke.png", "errors")]))
         sizes = {"sheet": "tilted", "correction": "two_pass", "mean_mm": 0.125, "max_mm": 4.25}
         report(demo.DemoResult([], [sizes], [demo.DemoFigure(bag.parent / "eye.png", "images")]))
 
@@ -103,7 +103,7 @@ def test_the_demo_ends_with_the_files_and_what_they_show(
     assert err.splitlines()[-5:] == [
         f"files to look at, in {tmp_path}:",
         "  eye.png: images",
-        "  latency.png: delays",
+        "  stroke.png: errors",
         "  demo.mcap: recording of all topics",
         f"all figures and faults of the recording: flexsheet bag report {tmp_path}/demo.mcap",
     ]

@@ -154,12 +154,6 @@ class MissingDataError(CommissionError):
         self.step, self.instruction = step, instruction
 
 
-class VerificationError(CommissionError):
-    """Raised if a running graph fails during the finger stroke that verifies the calibration."""
-
-    remedy = "Close other graphs, and run the same command again; finished steps are kept."
-
-
 Step = Callable[["Commissioning"], StepResult]
 
 

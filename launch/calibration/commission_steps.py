@@ -29,7 +29,6 @@ from flexsheet.launch.calibration.commission import (
     Step,
     StepName,
     StepResult,
-    VerificationError,
     list_doubts,
 )
 from flexsheet.launch.calibration.delays import MeasuredLag, measure_in_simulation, read_delays
@@ -67,7 +66,6 @@ from flexsheet.launch.commands import (
     calibrate_rows,
     capture,
 )
-from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.offline import (
     MOVING_METRICS,
@@ -596,7 +594,7 @@ def run_verification(
     simulated_time: whether to run the stroke in simulated time, without a graph. If true, the
         self-checks and the errors before calibration are omitted.
 
-    Raises VerificationError if the stroke fails.
+    Raises ExperimentError if the stroke fails; finished steps are kept.
     """
     from flexsheet.launch.experiments.trial import run_stroke
 
@@ -613,14 +611,7 @@ def run_verification(
         folders = {"after": (lab.launch_copy, lab.scene_copy)}
     else:
         trial = {"launch_file": str(lab.launch_copy), "seconds": seconds}
-        try:
-            stroke = run_stroke(trial, file)
-        except ExperimentInterruptedError:
-            raise
-        except ExperimentError as error:
-            raise VerificationError(
-                f"step {StepName.VERIFICATION}: {error}. {VerificationError.remedy}"
-            ) from error
+        stroke = run_stroke(trial, file)
         folders = {
             "before": (lab.launch_file, lab.scene_file),
             "after": (lab.launch_copy, lab.scene_copy),

@@ -161,14 +161,6 @@ def compliance(
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
     apparatus: options.ApparatusOption = None,
-    complete_table: Annotated[
-        bool,
-        typer.Option(
-            "--complete-table",
-            help="Compute the complete table of the soft body first, which takes up to an hour. "
-            "Otherwise, the coarse table is used if the complete table is not in the cache.",
-        ),
-    ] = False,
     output: options.ResultFolderOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -190,7 +182,6 @@ def compliance(
             experiment.make_compliance_procedure(progress),
             progress,
             apparatus=apparatus,
-            complete_table=complete_table,
         )
         result = experiment.compliance_result(bag, progress)
     if as_json:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.launch.experiments import image, stroke
-from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
+from flexsheet.launch.experiments.pictures import draw_eye_views, draw_stroke
 from flexsheet.launch.experiments.run import (
     Procedure,
     Progress,
@@ -48,7 +48,6 @@ of image correction that are compared.
 STROKE_FIGURE = (
     "errors of the sheet's position and angle during the strokes, and those of the paper"
 )
-LATENCY_FIGURE = "time from a camera image until the arms and the projected image react"
 EYE_FIGURE = "what the user sees on a tilted and on a pushed sheet, for each image correction"
 
 
@@ -141,11 +140,9 @@ def evaluate_strokes(bag: Path, strokes: Sequence[float]) -> DemoResult | None:
         stroke.stroke_result(recording, one, seconds, bag) for seconds, one in errors.items()
     ]
     write_file(bag.parent / "stroke.json", json.dumps(results, indent=1) + "\n")
-    plot, latency = bag.parent / "stroke.png", bag.parent / "latency.png"
+    plot = bag.parent / "stroke.png"
     draw_stroke(errors, plot)
-    draw_latency(recording, latency)
-    figures = [DemoFigure(plot, STROKE_FIGURE), DemoFigure(latency, LATENCY_FIGURE)]
-    return DemoResult(strokes=results[-1:], figures=figures)
+    return DemoResult(strokes=results[-1:], figures=[DemoFigure(plot, STROKE_FIGURE)])
 
 
 def evaluate_images(bag: Path, count: int) -> DemoResult | None:

@@ -10,14 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from flexsheet.launch.experiments.image import EyeImage
-from flexsheet.launch.experiments.stroke import (
-    PAPER_TABLE_1,
-    LatencyEvent,
-    StrokeErrors,
-    StrokeRecording,
-)
-
-EVENTS = tuple(event for event in LatencyEvent if event is not LatencyEvent.LIGHT)
+from flexsheet.launch.experiments.stroke import PAPER_TABLE_1, StrokeErrors
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)
@@ -106,34 +99,4 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
             axis.set_ylim(bottom=0)
             axis.grid(visible=True, alpha=0.2)
     figure.suptitle("Error of the sheet during strokes")
-    figure.savefig(path, dpi=110)
-
-
-def draw_latency(recording: StrokeRecording, path: Path) -> None:
-    """Draw the median and the 1 % and 99 % quantiles of the latency from exposure to each event."""
-    events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
-    figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
-    axes = figure.subplots()
-    for row, event in enumerate(events):
-        delays_ms = recording.delays_s[event] * 1e3
-        low, median, high = np.quantile(delays_ms, [0.01, 0.5, 0.99])
-        bar = axes.barh(row, high - low, left=low, height=0.5, color="C0", alpha=0.4)
-        (line,) = axes.plot([median, median], [row - 0.3, row + 0.3], color="C0", linewidth=2)
-        axes.text(
-            high, row, f"  median {median:.1f} ms, 99 %: {high:.1f} ms", va="center", fontsize=8
-        )
-    axes.set_yticks(range(len(events)), events)
-    axes.invert_yaxis()
-    longest_ms = max(np.quantile(recording.delays_s[event], 0.99) for event in events) * 1e3
-    axes.set_xlim(0, 1.45 * longest_ms)
-    axes.set_xlabel("time since the centre of the exposure, ms")
-    axes.set_title("Latency: time from a camera image to the events that it causes")
-    figure.legend(
-        [line, bar[0]],
-        ["median", "1 % to 99 % of the images"],
-        loc="outside lower center",
-        ncols=2,
-        fontsize=8,
-    )
-    axes.grid(visible=True, axis="x", alpha=0.2)
     figure.savefig(path, dpi=110)

@@ -116,14 +116,12 @@ def run_experiment(
     apparatus: str | None = None,
     needed: Collection[str] = (),
     check_scene: Callable[[Scene], object] = lambda scene: None,
-    complete_table: bool = False,
 ) -> None:
     """Run an experiment's procedure (coroutine) on the graph of a launch file.
 
     bag: file to which all topics are recorded, or None if nothing is recorded.
     check_scene: function that raises an error if the experiment does not support the scene.
     settings, apparatus, needed: arguments for `load_graph`.
-    complete_table: whether the soft body needs its complete table.
     """
     plan = load_graph(
         launch_file,
@@ -133,7 +131,7 @@ def run_experiment(
         needed=needed,
     )
     check_scene(require_scene(plan))
-    precompute_graph(plan, progress, complete_table=complete_table)
+    precompute_graph(plan, progress)
     try:
         asyncio.run(_await_interruptible(drive(plan, procedure, progress)))
     except (ExperimentError, NodeFailedError) as error:

@@ -37,13 +37,10 @@ def precompute_graph(
     progress: Progress,
     *,
     host: str | None = None,
-    complete_table: bool = False,
 ) -> None:
     """Compute the tables that the nodes of a graph need and that are not cached.
 
     host: host whose nodes are considered. If it is None, the nodes of all hosts are considered.
-    complete_table: whether the soft body needs the complete nonlinear table. Otherwise, the coarse
-        table is sufficient.
     """
     scene = plan.scene_message()
     if scene is None:
@@ -59,9 +56,7 @@ def precompute_graph(
         if issubclass(kind, node_class("fem_solver")) and scene.object.material is not None:
             given = FemSolverParameters.model_validate(node.parameters)
             choice = choose_method(scene, given.method, given.skin_spacing_m)
-            precompute_soft_body(
-                scene, choice, given.cache_dir, progress, complete_table=complete_table
-            )
+            precompute_soft_body(scene, choice, given.cache_dir, progress)
 
 
 def precompute_deflection_shapes(
