@@ -367,8 +367,8 @@ def test_sensitivity_ranks_parameters(tmp_path: Path, monkeypatch: pytest.Monkey
         return {"parameter": trial["parameter"], "effects": effects}
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
-    names = ",".join([*sizes, "eyes.sway_m", "finger.hand_mass_kg"])
-    arguments = ["experiment", "sensitivity", "--parameter", names, "--output", str(tmp_path)]
+    options = [f"--parameter={name}" for name in (*sizes, "eyes.sway_m", "finger.hand_mass_kg")]
+    arguments = ["experiment", "sensitivity", *options, "--output", str(tmp_path)]
     printed = CliRunner().invoke(app, [*arguments, "--json"], catch_exceptions=False)
     result = json.loads(printed.stdout)
     keys = {"parameter", "sigma", "sheet_mm", "image_mm", "force_percent", "fingertip_mm"}

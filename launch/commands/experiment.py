@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -81,7 +82,7 @@ def stroke(
     from flexsheet.launch.experiments import stroke as experiment
     from flexsheet.launch.experiments.run import (
         chain_procedures,
-        make_stroke_procedure,
+        make_path_procedure,
         make_switch_procedure,
         run_experiment,
     )
@@ -89,7 +90,7 @@ def stroke(
 
     bag = make_result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
-        procedure = make_stroke_procedure([seconds], progress)
+        procedure = make_path_procedure(partial(experiment.stroke_path, seconds=seconds), progress)
         if switches:
             procedure = chain_procedures(procedure, make_switch_procedure(switches, progress))
             given = [*given, "recorder.include=[stereo]"]
@@ -102,9 +103,7 @@ def stroke(
             apparatus=apparatus,
             check_scene=require_cylinder,
         )
-        recording = experiment.read_recording(bag)
-        errors = experiment.stroke_errors(recording, seconds)
-        result = experiment.stroke_result(recording, errors, seconds, bag)
+        result = experiment.evaluate_stroke(bag, seconds)
     if as_json:
         print_json(result)
     else:

@@ -18,8 +18,8 @@ from flexsheet.launch.experiments.run import (
     is_path_recorded,
     make_evaluation,
     make_image_procedure,
+    make_path_procedure,
     make_settings,
-    make_stroke_procedure,
     run_experiment,
 )
 from flexsheet.messages.files import write_file
@@ -117,7 +117,8 @@ def make_demo_procedures(bag: Path, progress: Progress, report: Report) -> list[
 
     for number, seconds in enumerate(SECONDS, 1):
         evaluate = partial(evaluate_strokes, bag, SECONDS[:number])
-        add(make_stroke_procedure([seconds], progress), evaluate, stroke.stroke_label(seconds))
+        make_path = partial(stroke.stroke_path, seconds=seconds)
+        add(make_path_procedure(make_path, progress), evaluate, stroke.stroke_label(seconds))
     for number, (series, value, corrections) in enumerate(IMAGES, 1):
         procedure = make_image_procedure(series, [value], corrections, progress, shading="soft")
         add(procedure, partial(evaluate_images, bag, number), series.name.format(value))

@@ -33,7 +33,7 @@ from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.followed import MAX_CONTACT_HEIGHT_M, read_followed_path
 from flexsheet.launch.experiments.run import (
     Progress,
-    make_stroke_procedure,
+    make_path_procedure,
     require_scene,
     run_experiment,
 )
@@ -432,7 +432,7 @@ def run_follow(
         times_s = np.arange(0.0, finger.duration_s, 0.5 * STEP_S)
         positions = np.array([finger.at(time_s)[0] for time_s in times_s])
     else:
-        procedure = make_stroke_procedure([], progress, path=path)
+        procedure = make_path_procedure(lambda _: path, progress)
         run_experiment(launch_file, settings, bag, procedure, progress, apparatus=apparatus)
         followed = read_followed_path(bag, path.label)
         times_s, positions = _read_true_finger(bag, path.label)

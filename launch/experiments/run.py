@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError, image, stroke
+from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError, image
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -166,23 +166,13 @@ def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
     return [f"{node.name}.{setting}" for node in graph.nodes_of_type(node_type)]
 
 
-def make_stroke_procedure(
-    seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
-) -> Procedure:
-    """Make a procedure (coroutine) that moves the finger along strokes, or along a given path.
-
-    seconds: durations of the finger's strokes, s.
-    path: finger path that replaces the strokes.
-    """
+def make_path_procedure(make_path: Callable[[Scene], FingerPath], progress: Progress) -> Procedure:
+    """Make a procedure (coroutine) that moves the finger along a path in the scene."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
-        if path is not None:
-            progress(f"{path.label} ({path.times_s[-1]:.0f} s)")
-            await driver.follow(path)
-            return
-        for duration in seconds:
-            progress(f"stroke over 60° in {duration:g} s")
-            await driver.follow(stroke.stroke_path(scene, duration))
+        path = make_path(scene)
+        progress(f"{path.label} ({path.times_s[-1]:.0f} s)")
+        await driver.follow(path)
 
     return procedure
 

@@ -747,3 +747,9 @@ def stroke_result(
         "busy_fraction": compute_busy_fraction(recording, seconds),
         "bag": str(bag),
     }
+
+
+def evaluate_stroke(bag: Path, seconds: float) -> dict[str, Any]:
+    """Return the results of the finger stroke with a duration of `seconds` in a bag."""
+    recording = read_recording(bag)
+    return stroke_result(recording, stroke_errors(recording, seconds), seconds, bag)

@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.offline import Metric, OfflineEvaluator, exceeded_tolerances
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import (
-    make_stroke_procedure,
+    make_path_procedure,
     require_scene,
     run_experiment,
 )
@@ -79,7 +80,7 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
     launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
     settings = [*choose_ports(launch_file), *trial.get("settings", ())]
     with _bag_of(trial) as bag:
-        procedure = make_stroke_procedure([seconds], _tell)
+        procedure = make_path_procedure(partial(stroke.stroke_path, seconds=seconds), _tell)
         run_experiment(
             launch_file,
             settings,
@@ -89,9 +90,7 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
             apparatus=apparatus,
             check_scene=require_cylinder,
         )
-        recording = stroke.read_recording(bag)
-        errors = stroke.stroke_errors(recording, seconds)
-        result = stroke.stroke_result(recording, errors, seconds, bag)
+        result = stroke.evaluate_stroke(bag, seconds)
         flagged = read_flags(bag)
     if not trial.get("bag"):
         result["bag"] = None
