@@ -116,7 +116,6 @@ async def measure_layout(page: Page, tab: BrowserTab, found: PageVisit) -> None:
         "ready": GraphState("cylinder", follow),
         "fault": GraphState("cylinder", blocked),
         "estop": GraphState("cylinder", follow, estop_reason="pressed at the console " * 4),
-        "busy": GraphState("cylinder", follow, overload="Each core has 8 programs to run."),
     }
     for name, state in states.items():
         page.show_state(state)
@@ -201,7 +200,7 @@ def test_nothing_moves_while_texts_change(found: PageVisit) -> None:
     """Earlier, a shorter text about the finger moved the sliders while a user dragged one."""
     assert len(found.slider_boxes) > 3
     assert len({str(box) for box in found.slider_boxes.values()}) == 1, found.slider_boxes
-    assert len(found.stop_boxes) == 5
+    assert len(found.stop_boxes) == 4
     assert len({str(box) for box in found.stop_boxes.values()}) == 1, found.stop_boxes
 
 

@@ -186,8 +186,8 @@ async def last_weeks_plan_is_refused(lab: Lab) -> None:
     assert theirs != ours
     lab.start("main", "left")
     lab.start("right", launch_file=old)
-    for host, word in (("right", f"{ours}', here it is {theirs}"),
-                       ("left", f"{theirs}', here it is {ours}")):  # fmt: skip
+    for host, word in (("right", f"{ours}', this node runs {theirs}"),
+                       ("left", f"{theirs}', this node runs {ours}")):  # fmt: skip
         log = lab.folder / f"{host}.log"
         await lab.until(lambda log=log, word=word: word in log.read_text(), f"{word} by {host}")
     lab.launchers["right"].kill()
@@ -200,7 +200,7 @@ async def last_weeks_plan_is_refused(lab: Lab) -> None:
 async def told_to_move(lab: Lab) -> None:
     """Enable the arms by the command, which fails until both are present."""
     for _ in range(10):
-        code, words = await lab.run("main", "arms", "ready", "--json")
+        code, words = await lab.run("main", "arms", "enable", "--json")
         if code == 0:
             break
     assert code == 0, words

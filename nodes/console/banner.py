@@ -20,15 +20,13 @@ class BannerState(IntEnum):
 
     READY = 0
     WAITING = 1
-    BUSY = 2
-    FAULT = 3
-    ESTOP = 4
+    FAULT = 2
+    ESTOP = 3
 
 
 GROUNDS = {
     BannerState.READY: "good",
     BannerState.WAITING: "quiet",
-    BannerState.BUSY: "warn",
     BannerState.FAULT: "bad",
     BannerState.ESTOP: "bad",
 }
@@ -71,8 +69,6 @@ class GraphState:
             return BannerState.ESTOP
         if any(map(is_faulty, self.arms.values())):
             return BannerState.FAULT
-        if self.overload:
-            return BannerState.BUSY
         if self.arms and all(arm.mode == "follow" for arm in self.arms.values()):
             return BannerState.READY
         return BannerState.WAITING
@@ -112,11 +108,7 @@ def _title(state: GraphState, shown: BannerState) -> str:
         case BannerState.ESTOP:
             return f"E-STOP is engaged: {state.stopped}"
         case BannerState.FAULT:
-            faults = "; ".join(_describe(side, arm) for side, arm in state.arms.items())
-            # Name the probable cause of the faults first.
-            return f"The computer is busy. {faults}" if state.overload else faults
-        case BannerState.BUSY:
-            return "The computer is busy"
+            return "; ".join(_describe(side, arm) for side, arm in state.arms.items())
         case _ if state.arms:
             modes = sorted({MODES[arm.mode] for arm in state.arms.values()})
             return f"Arms: {' / '.join(modes)}"
