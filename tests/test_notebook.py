@@ -13,8 +13,8 @@ from flexsheet.launch.experiments import image, stroke
 from flexsheet.launch.experiments.run import (
     chain_procedures,
     make_image_procedure,
+    make_path_procedure,
     make_settings,
-    make_stroke_procedure,
     run_experiment,
 )
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, find_file
@@ -109,7 +109,7 @@ def test_the_notebook_reproduces_the_paper_from_a_recorded_bag(tmp_path: Path) -
     demo = find_file(Path("demo"), LAUNCH_FILES)
     bag = tmp_path / "paper.mcap"
     procedure = chain_procedures(
-        make_stroke_procedure([10.0], print),
+        make_path_procedure(lambda scene: stroke.stroke_path(scene, 10.0), print),
         make_image_procedure(image.TILT, [-40], image.CORRECTIONS, print),
         make_image_procedure(image.PUSH, [30], image.CORRECTIONS, print),
     )
