@@ -265,7 +265,7 @@ async def test_an_object_is_made_ready_to_point_at_beside_the_loop(
     finger.advance(1.0, None)
     assert not sent, "its shape is not known yet"
     async with asyncio.timeout(DEADLINE_S):
-        while not sent:  # it is told by a task
+        while not sent:  # a task sends it
             await asyncio.sleep(0)
             finger.advance(1.0, None)
     await controller.close()

@@ -128,14 +128,10 @@ class _FoxgloveFile:
     """An MCAP file with the channels of Foxglove."""
 
     def __init__(self, draft: Path, reader: BagReader) -> None:
-        try:
-            import foxglove
+        import foxglove
 
-            from flexsheet.launch.viewing import channels
-        except ImportError as error:
-            raise ExportError(
-                "`bag export` needs the package foxglove-sdk; run: pip install 'flexsheet[view]'"
-            ) from error
+        from flexsheet.launch.viewing import channels
+
         self._library, self._draft = channels, draft
         self._state = channels.ViewState()
         self._context = foxglove.Context()

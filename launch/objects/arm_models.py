@@ -125,6 +125,7 @@ def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
 
 
 def _load_joints(path: Path) -> list[Any]:
+    # An optional package without types; mypy also runs where it is not installed.
     import yourdfpy  # type: ignore[import-untyped,import-not-found,unused-ignore]
 
     try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from importlib.util import find_spec
 from typing import Any
 
 import psutil
@@ -108,8 +107,6 @@ class RosParticipant:
     """
 
     def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
-        if find_spec("cyclonedds") is None:
-            raise Ros2Error("the bridge needs cyclonedds; run: pip install 'flexsheet[ros2]'")
         from cyclonedds.core import DDSException
         from cyclonedds.domain import Domain, DomainParticipant
 

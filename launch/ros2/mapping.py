@@ -15,7 +15,6 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -79,14 +78,9 @@ def split_time(at_ns: int) -> dict[str, int]:
 
 
 class RosTypes:
-    """A codec for ROS 2 messages in the CDR format.
-
-    Raises Ros2Error if the package rosbags is not installed.
-    """
+    """A codec for ROS 2 messages in the CDR format."""
 
     def __init__(self) -> None:
-        if find_spec("rosbags") is None:
-            raise Ros2Error("ROS 2 messages need rosbags; run: pip install 'flexsheet[ros2]'")
         from rosbags.typesys import Stores, get_typestore
 
         # Humble and later releases have the same definitions of these types.

@@ -104,7 +104,8 @@ def start_server(port: int, label: str) -> viser.ViserServer:
             raise ConsoleError(
                 f"page_port: port {port} is in use; choose another: --set console.page_port=PORT"
             ) from error
-    # viser has no option for `process_request`. It prints its address before the graph is ready.
+    # viser has no option for `process_request`, so it starts with another `serve`, which the types
+    # of websockets do not allow. It prints its address before the graph is ready.
     websockets.asyncio.server.serve = serve_checked  # type: ignore[assignment,misc]
     try:
         with redirect_stdout(io.StringIO()):

@@ -43,12 +43,8 @@ def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[E
 
 def _connect(address: str, connect_s: float) -> Any:
     """Return a client of a scheduler whose workers have the version of this project."""
-    try:
-        import distributed  # an optional dependency that is slow to import
-    except ImportError as error:
-        raise SchedulerError(
-            "--scheduler requires the package distributed; run: pip install flexsheet[cluster]"
-        ) from error
+    import distributed  # an optional dependency that is slow to import
+
     untyped: Any = distributed
     remedy = f"start `dask scheduler` and `dask worker {address}`, or omit --scheduler"
     try:
