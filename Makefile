@@ -130,7 +130,7 @@ limits: setup $(DEV_STAMP)  ## measure the disturbances of the fingertip in docs
 pages: setup  ## insert figures from docs/results into the pages, and draw docs/images
 	$(BIN)/python -m website.pages
 
-charts: setup  ## measure every method of every family for docs/charts; takes 7 minutes on 2 cores
+charts: setup  ## measure every method of every family for docs/charts
 	$(BIN)/flexsheet chart --output docs/charts
 
 # An interrupted command continues.
